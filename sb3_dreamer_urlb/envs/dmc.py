@@ -1,0 +1,140 @@
+"""Builders: from a task's name to an environment. Importing this module imports no dm_control."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from sb3_dreamer_urlb.envs.options import PixelOptions
+from sb3_dreamer_urlb.envs.registration import URLB_TASKS, check_urlb_task
+from sb3_dreamer_urlb.envs.rendering import load_renderer
+
+if TYPE_CHECKING:
+    from dm_control import composer
+    from dm_control.rl import control
+
+
+def make_urlb_env(
+    domain: str,
+    task: str,
+    *,
+    image_size: int = 64,
+    action_repeat: int = 2,
+    camera: int | str | None = None,
+    reward_free: bool = False,
+    fast_render: bool = False,
+    render_mode: str | None = None,
+    render_size: int = 256,
+) -> gymnasium.Env[Any, Any]:
+    """One of the twelve tasks of the benchmark. The defaults are the paper's ("Mastering the Unsupervised Reinforcement
+    Learning Benchmark from Pixels", ICML 2023).
+
+    :param domain: ``walker``, ``quadruped`` or ``jaco``
+    :param task: a task of that domain, see ``URLB_TASKS``
+    :param image_size: height and width of the observations in pixels
+    :param action_repeat: control steps an action is held for
+    :param camera: a camera's id or name; None for 2 in the quadruped (``y``), else 0 (``side``, ``front_close``)
+    :param reward_free: return a reward of 0.0 and keep the task's in ``info["task_reward"]``
+    :param fast_render: smaller shadow map: faster, not pixel-identical
+    :param render_mode: None, ``"rgb_array"`` or ``"human"``
+    :param render_size: height and width of what ``render()`` returns
+    :return: observations uint8 (image_size, image_size, 3), actions float32 (A,) in [-1, 1]; see
+        :class:`~sb3_dreamer_urlb.envs.pixel_env.PixelControlEnv`, and :class:`~sb3_dreamer_urlb.envs.options.PixelOptions`
+        for the options
+    :raises ValueError: naming a wrong option, its value and what was expected
+    :raises RenderingBackendError: if MuJoCo cannot render here
+    """
+    check_urlb_task(domain, task)
+    return make_dmc_env(
+        domain,
+        task,
+        image_size=image_size,
+        action_repeat=action_repeat,
+        camera=camera,
+        reward_free=reward_free,
+        fast_render=fast_render,
+        render_mode=render_mode,
+        render_size=render_size,
+    )
+
+
+def make_dmc_env(
+    domain: str,
+    task: str,
+    *,
+    image_size: int = 64,
+    action_repeat: int = 2,
+    camera: int | str | None = None,
+    reward_free: bool = False,
+    fast_render: bool = False,
+    render_mode: str | None = None,
+    render_size: int = 256,
+) -> gymnasium.Env[Any, Any]:
+    """Any task of dm_control's suite, any of ``dm_control.manipulation``, or one of the benchmark's.
+
+    :param domain: a domain of the suite, ``"manipulation"``, or one of the benchmark's
+    :param task: a task of that domain, e.g. ``"swingup"`` of ``"cartpole"``, ``"reach_site_vision"`` of ``"manipulation"``
+    :param image_size: this and the following as in :func:`make_urlb_env`
+    :param action_repeat: control steps an action is held for
+    :param camera: a camera's id or name
+    :param reward_free: return a reward of 0.0
+    :param fast_render: faster, not pixel-identical
+    :param render_mode: None, ``"rgb_array"`` or ``"human"``
+    :param render_size: height and width of what ``render()`` returns
+    :return: as :func:`make_urlb_env`
+    :raises ValueError: naming a wrong option, its value and what was expected
+    :raises RenderingBackendError: if MuJoCo cannot render here
+    """
+    if camera is None:
+        camera = 2 if domain == "quadruped" else 0
+    options = PixelOptions(
+        image_size=image_size,
+        action_repeat=action_repeat,
+        camera=camera,
+        reward_free=reward_free,
+        fast_render=fast_render,
+        render_mode=render_mode,
+        render_size=render_size,
+    )
+    control_env = make_control_env(domain, task)
+
+    from sb3_dreamer_urlb.envs.pixel_env import PixelControlEnv
+
+    in_window = options.render_mode == "human"
+    if in_window:
+        options = dataclasses.replace(options, render_mode="rgb_array")
+    is_urlb = task in URLB_TASKS.get(domain, ())
+    env = PixelControlEnv(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
+    return gymnasium.wrappers.HumanRendering(env) if in_window else env
+
+
+def make_control_env(domain: str, task: str) -> control.Environment | composer.Environment:
+    """The bare dm_control environment of a task: without pixels, action repeat or rescaled actions.
+
+    :param domain: as for :func:`make_dmc_env`
+    :param task: as for :func:`make_dmc_env`
+    :return: unseeded; its class is ``composer.Environment`` for ``jaco`` and ``manipulation``
+    :raises ValueError: if there is no such task; it lists those there are
+    :raises RenderingBackendError: if MuJoCo cannot render here (dm_control binds itself to OpenGL when it is imported)
+    """
+    load_renderer()
+    from dm_control import manipulation, suite
+
+    from sb3_dreamer_urlb.envs.jaco import make_jaco_task, make_manipulation_task
+    from sb3_dreamer_urlb.envs.urlb_tasks import make_suite_task
+
+    known = {name: tuple(tasks) for name, tasks in suite.TASKS_BY_DOMAIN.items()}
+    known["manipulation"] = tuple(manipulation.ALL)
+    for name, tasks in URLB_TASKS.items():
+        known[name] = (*tasks, *(other for other in known.get(name, ()) if other not in tasks))
+    if domain not in known:
+        raise ValueError(f"domain={domain!r}: expected one of {', '.join(sorted(known))}")
+    if task not in known[domain]:
+        raise ValueError(f"task={task!r}: {domain} has {', '.join(known[domain])}")
+    if domain == "jaco":
+        return make_jaco_task(task)
+    if domain == "manipulation":
+        return make_manipulation_task(task)
+    return make_suite_task(domain, task)

@@ -1,0 +1,88 @@
+"""The benchmark's four Jaco tasks: reach one corner of the table (URLB, Laskin et al. 2021).
+
+They are dm_control's reach task with a Duplo brick, only that the brick always starts in the same place. The reward is
+1 while the hand is within 5 cm of the brick and falls to 0.1 at 10 cm; the hand starts 27 to 46 cm away. The brick is
+free to move, and the reward follows it.
+"""
+
+# ruff: noqa: E402 - an OpenGL backend must be chosen before dm_control is imported
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sb3_dreamer_urlb.envs.rendering import load_renderer
+
+load_renderer()
+
+from dm_control import composer
+from dm_control.composer.observation import observable
+from dm_control.entities import props
+from dm_control.manipulation import reach
+from dm_control.manipulation.shared import arenas, constants, observations, registry, robots, workspaces
+
+_TIME_LIMIT = 10.0  # seconds: 250 control steps; that of all of dm_control's manipulation tasks
+_BRICK_Z = 0.001  # metres: just above the table, on which it then settles
+
+# Where the brick starts, (x, y) in metres, seen from the front camera.
+_BRICK_XY = {
+    "reach_top_left": (-0.09, 0.09),
+    "reach_top_right": (0.09, 0.09),
+    "reach_bottom_left": (-0.09, -0.09),
+    "reach_bottom_right": (0.09, -0.09),
+}
+
+
+class _Workspace(NamedTuple):
+    """What dm_control's ``Reach`` asks of a workspace.
+
+    :param target_bbox: where the brick starts
+    :param tcp_bbox: where the hand's tool centre point starts
+    :param arm_offset: where the arm stands
+    """
+
+    target_bbox: workspaces.BoundingBox
+    tcp_bbox: workspaces.BoundingBox
+    arm_offset: tuple[float, float, float]
+
+
+def make_jaco_task(task: str) -> composer.Environment:
+    """One of the four reach tasks.
+
+    :param task: ``reach_top_left``, ``reach_top_right``, ``reach_bottom_left`` or ``reach_bottom_right``
+    :return: the bare composer environment, unseeded (Shimmy cannot seed one that is wrapped)
+    """
+    # An enabled camera renders at every control step; we render once per agent step, and get the same pixels.
+    camera_off = observations.VISION.camera._replace(enabled=False)
+    settings = observations.VISION._replace(camera=camera_off)
+
+    brick_position = (*_BRICK_XY[task], _BRICK_Z)
+    workspace = _Workspace(
+        target_bbox=workspaces.BoundingBox(lower=brick_position, upper=brick_position),
+        tcp_bbox=workspaces.BoundingBox(lower=(-0.1, -0.1, 0.2), upper=(0.1, 0.1, 0.4)),
+        arm_offset=robots.ARM_OFFSET,
+    )
+    reach_task = reach.Reach(
+        arena=arenas.Standard(),
+        arm=robots.make_arm(obs_settings=settings),
+        hand=robots.make_hand(obs_settings=settings),
+        prop=props.Duplo(observable_options=observations.make_options(settings, observations.FREEPROP_OBSERVABLES)),
+        obs_settings=settings,
+        workspace=workspace,
+        control_timestep=constants.CONTROL_TIMESTEP,
+    )
+    # Composer compiles the model anew each episode. That costs 0.3 s of rendering set-up, and is kept: without it all
+    # episodes but the first differ from the benchmark's.
+    return composer.Environment(reach_task, time_limit=_TIME_LIMIT)
+
+
+def make_manipulation_task(task: str) -> composer.Environment:
+    """Any of dm_control's own manipulation tasks, which show the same arm.
+
+    :param task: a name of ``dm_control.manipulation.ALL``
+    :return: the bare composer environment, unseeded, with its cameras' observables off (as for the reach tasks)
+    """
+    manipulation_task = registry.get_constructor(task)()
+    for feature in manipulation_task.observables.values():
+        if isinstance(feature, observable.MJCFCamera):
+            feature.enabled = False
+    return composer.Environment(manipulation_task, time_limit=_TIME_LIMIT)

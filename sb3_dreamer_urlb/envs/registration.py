@@ -1,0 +1,60 @@
+"""The benchmark's tasks by name, and their gymnasium ids. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import gymnasium
+
+#: The three domains with four tasks each (URLB, Laskin et al. 2021).
+URLB_TASKS: dict[str, tuple[str, ...]] = {
+    "walker": ("stand", "walk", "run", "flip"),
+    "quadruped": ("stand", "walk", "run", "jump"),
+    "jaco": ("reach_top_left", "reach_top_right", "reach_bottom_left", "reach_bottom_right"),
+}
+
+DOMAINS: tuple[str, ...] = tuple(URLB_TASKS)
+
+#: The task whose environment an agent is pre-trained in, one a domain; its reward is not used.
+PRIMAL_TASK: dict[str, str] = {"walker": "stand", "quadruped": "walk", "jaco": "reach_top_left"}
+
+
+def env_id(domain: str, task: str) -> str:
+    """The gymnasium id of one of the benchmark's tasks, such as ``urlb/walker-run-v0``.
+
+    :param domain: a domain of ``URLB_TASKS``
+    :param task: a task of that domain
+    :raises ValueError: if there is no such task
+    """
+    check_urlb_task(domain, task)
+    return f"urlb/{domain}-{task}-v0"
+
+
+def check_urlb_task(domain: str, task: str) -> None:
+    """:raises ValueError: if this is not one of the benchmark's tasks; it lists those there are"""
+    if domain not in URLB_TASKS:
+        raise ValueError(f"domain={domain!r}: expected one of {', '.join(DOMAINS)}")
+    if task not in URLB_TASKS[domain]:
+        raise ValueError(f"task={task!r}: {domain} has {', '.join(URLB_TASKS[domain])}")
+
+
+def register_envs() -> None:
+    """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, and ``urlb/dm_control-v0`` for any other
+    task of dm_control (``gymnasium.make("urlb/dm_control-v0", domain="cartpole", task="swingup")``).
+
+    Entry points are strings, so that a spawned process can load them. No ``max_episode_steps``: dm_control truncates, and
+    the environment tells its length in its own attribute of that name. May be called again.
+    """
+    for domain, tasks in URLB_TASKS.items():
+        for task in tasks:
+            _register(env_id(domain, task), "make_urlb_env", {"domain": domain, "task": task})
+    _register("urlb/dm_control-v0", "make_dmc_env", {})
+
+
+def _register(name: str, function: str, kwargs: dict[str, str]) -> None:
+    """Register one id, unless it is.
+
+    :param name: the id
+    :param function: of the module ``dmc``
+    :param kwargs: its arguments
+    """
+    if name not in gymnasium.registry:
+        gymnasium.register(name, entry_point=f"sb3_dreamer_urlb.envs.dmc:{function}", kwargs=kwargs)
