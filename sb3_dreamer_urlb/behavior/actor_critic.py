@@ -1,0 +1,101 @@
+"""Actor and critic that learn in imagination (paper §2, spec/algorithms §2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch as th
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.distributions import BoundedNormal
+from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.types import Imagination, Metrics
+
+MIN_STD = 0.1
+
+
+class Actor(nn.Module):
+    """π(a | z): a bounded normal with mean tanh(m) and standard deviation 2·σ(s/2) + 0.1.
+
+    :param feature_size: F
+    :param action_size: A
+    :param net_arch: widths of the hidden layers
+    """
+
+    def __init__(self, feature_size: int, action_size: int, net_arch: Sequence[int]):
+        super().__init__()
+        self.body = MLP(feature_size, net_arch, action_size)
+        self.out_std = nn.Linear(self.body.out.in_features, action_size)
+        self.action_size = action_size
+
+    def forward(self, feature: th.Tensor) -> BoundedNormal:
+        """(…, F) → distribution over (…, A)."""
+        hidden = self.body.hidden(feature)
+        std = 2 * th.sigmoid(self.out_std(hidden) / 2) + MIN_STD
+        return BoundedNormal(th.tanh(self.body.out(hidden)), std)
+
+
+class RewardNormalizer(nn.Module):
+    """Divides rewards by an exponential moving average of their mean absolute value (paper, appendix B).
+
+    :param momentum: μ in m ← μ·m + (1 − μ)·mean|r|; 1 switches it off
+    """
+
+    scale: th.Tensor
+
+    def __init__(self, momentum: float):
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("scale", th.ones(()))
+
+    def forward(self, reward: th.Tensor) -> th.Tensor:
+        """Take ``reward`` (any shape) into the average, then normalise it by the average."""
+        with th.no_grad():
+            self.scale.lerp_(reward.abs().mean(), 1 - self.momentum)
+        # A copy: the buffer changes in place at the next call, while autograd still needs today's value.
+        return reward / (self.scale.clone() + 1e-8)
+
+
+def with_entropy_bonus(returns: th.Tensor, entropy: th.Tensor, ent_coef: float) -> th.Tensor:
+    """What actor and critic aim at: λ-returns, from z_1 on with the entropy of the choice that led there.
+
+    No text says that the critic's targets carry the bonus too: the authors' code adds it in place, to the λ-returns that
+    the critic then learns, and their numbers include it (≈ 5e-4 at ent_coef 1e-4).
+
+    :param returns: λ-returns of z_0 … z_{H-1}, float (H, N)
+    :param entropy: of the actor at z_0 … z_{H-1}, float (H, N)
+    :param ent_coef: weight of the bonus
+    """
+    return th.cat([returns[:1], returns[1:] + ent_coef * entropy[:-1]])
+
+
+def actor_loss(target: th.Tensor, weight: th.Tensor) -> th.Tensor:
+    """− mean(weight · target of the next state); gradients flow through the dynamics (``actor_grad = dynamics``).
+
+    :param target: of z_0 … z_{H-1}, with gradients to the actor, float (H, N)
+    :param weight: of z_0 … z_{H-1}, float (H, N)
+    """
+    return -(weight[:-1] * target[1:]).mean()
+
+
+def discount_weights(discount: th.Tensor) -> th.Tensor:
+    """How likely each state is to be reached: the product of the discounts before it, (H + 1, N) → (H, N)."""
+    return th.cat([th.ones_like(discount[:1]), discount[:-2].cumprod(0)])
+
+
+def critic_loss(value: th.Tensor, target: th.Tensor, weight: th.Tensor) -> th.Tensor:
+    """Weighted negative log-likelihood of the targets under a unit normal at the critic's value, all (H, N)."""
+    return (weight * distributions.unit_normal_nll(value, target)).mean()
+
+
+def behavior_metrics(imagination: Imagination, raw_reward: th.Tensor, reward: th.Tensor, returns: th.Tensor) -> Metrics:
+    """What one wants to see of a behaviour update, detached scalars."""
+    with th.no_grad():
+        return {
+            "imagined_reward": raw_reward.mean(),
+            "imagined_reward_std": raw_reward.std(),
+            "normalized_reward": reward.mean(),
+            "critic_target": returns.mean(),
+            "actor_entropy": imagination.entropy[:-1].mean(),
+        }

@@ -1,0 +1,120 @@
+"""Random draws and the three densities of the agent: one-hot categorical, bounded normal, unit-variance normal.
+
+Every draw of the whole agent goes through ``draw_classes`` and ``draw_normal``, called through this module, so a test
+can make the agent deterministic by replacing those two functions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch as th
+import torch.nn.functional as F
+
+HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+ACTION_MARGIN = 1e-6
+
+
+def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+    """Draw one class per categorical by inverting its cumulative distribution.
+
+    One uniform number per variable instead of one Gumbel number per class.
+
+    :param probs: non-negative weights, (…, K); they need not sum to one
+    :param generator: source of randomness, the global one if None
+    :return: class indices, int64 (…)
+    """
+    cdf = probs.cumsum(-1)
+    uniform = th.rand(cdf.shape[:-1] + (1,), generator=generator, device=cdf.device, dtype=cdf.dtype)
+    return (cdf[..., :-1] <= uniform * cdf[..., -1:]).sum(-1)
+
+
+def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+    """Standard normal noise.
+
+    :param shape: of the noise
+    :param like: a tensor whose device and dtype the noise takes
+    :param generator: source of randomness, the global one if None
+    """
+    return th.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
+
+
+def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+    """Draw one-hot vectors with straight-through gradients (DreamerV2): forward the draw, backward the probabilities.
+
+    :param logits: (…, S, K)
+    :param generator: source of randomness
+    :return: one-hot float (…, S, K)
+    """
+    probs = logits.softmax(-1)
+    index = draw_classes(probs.detach(), generator)
+    one_hot = th.zeros_like(probs).scatter_(-1, index.unsqueeze(-1), 1.0)
+    if not probs.requires_grad:
+        return one_hot
+    return one_hot + (probs - probs.detach())
+
+
+def categorical_kl(logits_p: th.Tensor, logits_q: th.Tensor) -> th.Tensor:
+    """KL(p ‖ q) in nats, summed over the S variables: (…, S, K) → (…)."""
+    log_p, log_q = logits_p.log_softmax(-1), logits_q.log_softmax(-1)
+    return (log_p.exp() * (log_p - log_q)).sum((-1, -2))
+
+
+def categorical_entropy(logits: th.Tensor) -> th.Tensor:
+    """Entropy in nats, summed over the S variables: (…, S, K) → (…)."""
+    log_p = logits.log_softmax(-1)
+    return -(log_p.exp() * log_p).sum((-1, -2))
+
+
+def unit_normal_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """Negative log-likelihood of ``target`` under a normal of unit variance, constant included, elementwise."""
+    return 0.5 * (mean - target).square() + HALF_LOG_2PI
+
+
+def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images, in one pass over the pixels.
+
+    :param mean: float (…, C, height, width)
+    :param target: same shape
+    :return: scalar
+    """
+    pixels = mean.shape[-3:].numel()
+    images = mean.numel() // pixels
+    return 0.5 * F.mse_loss(mean, target, reduction="sum") / images + pixels * HALF_LOG_2PI
+
+
+class BoundedNormal:
+    """The actor's distribution: a normal whose samples are clamped to the action box.
+
+    Entropy and log-probability are those of the *untruncated* normal, as in the authors' code (spec/algorithms §2).
+
+    :param mean: in (-1, 1), float (…, A)
+    :param std: positive, float (…, A)
+    """
+
+    def __init__(self, mean: th.Tensor, std: th.Tensor):
+        self.mean = mean
+        self.std = std
+
+    def sample(self, generator: th.Generator | None = None) -> th.Tensor:
+        """A reparametrised sample clamped to ±(1 − 1e-6); the clamp passes gradients straight through."""
+        sample = self.mean + self.std * draw_normal(self.mean.shape, self.mean, generator)
+        clamped = sample.detach().clamp(-1 + ACTION_MARGIN, 1 - ACTION_MARGIN)
+        return sample + (clamped - sample.detach()) if sample.requires_grad else clamped
+
+    def entropy(self) -> th.Tensor:
+        """In nats, summed over the action's dimensions: (…)."""
+        return (self.std.log() + 0.5 + HALF_LOG_2PI).sum(-1)
+
+    def log_prob(self, action: th.Tensor) -> th.Tensor:
+        """Log-density of ``action``, summed over its dimensions: (…)."""
+        return -(0.5 * ((action - self.mean) / self.std).square() + self.std.log() + HALF_LOG_2PI).sum(-1)
+
+
+def bernoulli_nll(logit: th.Tensor, target: th.Tensor) -> th.Tensor:
+    """Negative log-likelihood of a Bernoulli variable, elementwise.
+
+    :param logit: log-odds
+    :param target: probability of one, same shape
+    """
+    return F.binary_cross_entropy_with_logits(logit, target, reduction="none")

@@ -1,0 +1,154 @@
+"""One update on one batch: losses → backward → optimiser steps. The only place where parameters change.
+
+Nothing here asks the device for a value: metrics stay tensors until somebody logs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from torch import nn
+
+from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.behavior import actor_critic
+from sb3_dreamer_urlb.behavior.returns import lambda_return
+from sb3_dreamer_urlb.intrinsic.base import RewardSource, TaskReward
+from sb3_dreamer_urlb.optim import ClippedAdam
+from sb3_dreamer_urlb.types import LatentState, Metrics, Posterior, SequenceBatch
+
+
+@dataclass(frozen=True)
+class LearnerConfig:
+    """The numbers of an update; see :class:`~sb3_dreamer_urlb.DreamerV2` for what each means and its default."""
+
+    learning_rate: float
+    actor_learning_rate: float
+    critic_learning_rate: float
+    adam_eps: float
+    max_grad_norm: float
+    weight_decay: float
+    free_nats: float
+    kl_balance: float
+    imagination_horizon: int
+    gae_lambda: float
+    target_update_interval: int
+    ent_coef: float
+    reward_trains_model: bool
+
+
+class Learner:
+    """Trains an agent; the order is the paper's: world model, intrinsic reward, actor, critic.
+
+    :param agent: the networks
+    :param config: the numbers
+    """
+
+    def __init__(self, agent: Agent, config: LearnerConfig):
+        self.agent = agent
+        self.config = config
+        self.updates = 0
+        self.model_optimizer = self._optimizer(agent.world_model, config.learning_rate)
+        self.actor_optimizer = self._optimizer(agent.actor, config.actor_learning_rate)
+        self.critic_optimizer = self._optimizer(agent.critic, config.critic_learning_rate)
+        self.intrinsic_optimizer: ClippedAdam | None = None
+        self.reward_source: RewardSource = TaskReward(agent.world_model.reward)
+        if agent.intrinsic is not None:
+            self.reward_source = agent.intrinsic
+            if any(True for _ in agent.intrinsic.parameters()):
+                self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
+
+    def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
+        config = self.config
+        return ClippedAdam(module.parameters(), learning_rate, config.adam_eps, config.max_grad_norm, config.weight_decay)
+
+    def optimizers(self) -> dict[str, ClippedAdam]:
+        """All optimisers by name; the names are those of snapshots."""
+        found = {
+            "model_optimizer": self.model_optimizer,
+            "actor_optimizer": self.actor_optimizer,
+            "critic_optimizer": self.critic_optimizer,
+            "intrinsic_optimizer": self.intrinsic_optimizer,
+        }
+        return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
+
+    def update(self, batch: SequenceBatch) -> Metrics:
+        """Learn from one batch.
+
+        :param batch: (B, T, …) on the agent's device
+        :return: metrics, detached scalars on the device
+        """
+        posterior, metrics = self._update_world_model(batch)
+        metrics.update(self._update_intrinsic(posterior, batch))
+        metrics.update(self._update_behavior(posterior.state))
+        self.updates += 1
+        return metrics
+
+    def _update_world_model(self, batch: SequenceBatch) -> tuple[Posterior, Metrics]:
+        config = self.config
+        loss, posterior, metrics = self.agent.world_model.loss(
+            batch, config.free_nats, config.kl_balance, config.reward_trains_model
+        )
+        metrics["model_grad_norm"] = self.model_optimizer.step(loss)
+        return _detached(posterior), metrics
+
+    def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
+        if self.agent.intrinsic is None or self.intrinsic_optimizer is None:
+            return {}
+        loss, metrics = self.agent.intrinsic.loss(posterior, batch)
+        metrics = {f"intrinsic_{name}": value for name, value in metrics.items()}
+        metrics["intrinsic_grad_norm"] = self.intrinsic_optimizer.step(loss)
+        metrics["intrinsic_loss"] = loss.detach()
+        return metrics
+
+    def _update_behavior(self, start: LatentState) -> Metrics:
+        agent, config = self.agent, self.config
+        with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic):
+            imagination = agent.world_model.imagine(agent.actor, start.flatten(), config.imagination_horizon)
+            raw_reward = self.reward_source.reward(imagination)
+            reward = agent.reward_normalizer(raw_reward)
+            discount = agent.world_model.discount(imagination.feature)
+            value = agent.slow_critic(imagination.feature)
+            weight = actor_critic.discount_weights(discount.detach())
+            returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
+            target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
+            loss = actor_critic.actor_loss(target, weight)
+            actor_grad_norm = self.actor_optimizer.step(loss)
+        value_now = agent.critic(imagination.feature[:-1].detach())
+        critic_loss = actor_critic.critic_loss(value_now, target.detach(), weight)
+        critic_grad_norm = self.critic_optimizer.step(critic_loss)
+        if self.updates % config.target_update_interval == 0:
+            agent.slow_critic.load_state_dict(agent.critic.state_dict())
+        return {
+            **actor_critic.behavior_metrics(imagination, raw_reward, reward, returns),
+            "actor_loss": loss.detach(),
+            "actor_grad_norm": actor_grad_norm,
+            "critic_loss": critic_loss.detach(),
+            "critic_grad_norm": critic_grad_norm,
+            "critic": value_now.detach().mean(),
+        }
+
+
+def _detached(posterior: Posterior) -> Posterior:
+    return Posterior(
+        posterior.state.detach(),
+        posterior.feature.detach(),
+        posterior.embed.detach(),
+        posterior.post_logits.detach(),
+        posterior.prior_logits.detach(),
+        posterior.kl,
+    )
+
+
+@contextmanager
+def _frozen(*modules: nn.Module | None) -> Iterator[None]:
+    """Let gradients pass through the modules to their inputs only: their weights' gradients are not computed."""
+    parameters = [p for module in modules if module is not None for p in module.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)

@@ -1,0 +1,37 @@
+"""The multi-layer perceptron that every head, the actor and the critic are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+
+class MLP(nn.Module):
+    """ELU layers ``dense`` and one linear output ``out`` (spec/algorithms §1, "MLP 4×400 ELU").
+
+    :param inputs: size of the input
+    :param net_arch: widths of the hidden layers
+    :param outputs: size of the output; 1 gives a scalar head whose last dimension is dropped
+    """
+
+    def __init__(self, inputs: int, net_arch: Sequence[int], outputs: int = 1):
+        super().__init__()
+        widths = [inputs, *net_arch]
+        self.dense = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
+        self.out = nn.Linear(widths[-1], outputs)
+        self.scalar = outputs == 1
+
+    def hidden(self, x: th.Tensor) -> th.Tensor:
+        """The last hidden layer, (…, inputs) → (…, net_arch[-1])."""
+        for layer in self.dense:
+            x = F.elu(layer(x))
+        return x
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """(…, inputs) → (…, outputs), or (…) for a scalar head."""
+        y = self.out(self.hidden(x))
+        return y.squeeze(-1) if self.scalar else y

@@ -1,0 +1,59 @@
+"""The optimiser of every part: clip the global norm, shrink every weight a little, Adam step (spec/algorithms §1)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch as th
+from torch import nn
+
+
+class ClippedAdam:
+    """Adam with a global gradient-norm bound and a weight decay that does not scale with the learning rate.
+
+    :param parameters: what it trains
+    :param learning_rate: step size
+    :param eps: Adam's ε
+    :param max_grad_norm: bound of the gradient's global norm
+    :param weight_decay: every parameter is multiplied by (1 − weight_decay) in each step
+    """
+
+    def __init__(
+        self, parameters: Iterable[nn.Parameter], learning_rate: float, eps: float, max_grad_norm: float, weight_decay: float
+    ):
+        self.parameters = list(parameters)
+        self.max_grad_norm = max_grad_norm
+        self.weight_decay = weight_decay
+        self.adam = th.optim.AdamW(self.parameters, lr=learning_rate, eps=eps, weight_decay=0.0, fused=True)
+        self.set_learning_rate(learning_rate)
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """Change the step size; the weight decay stays what it is."""
+        for group in self.adam.param_groups:
+            group["lr"] = learning_rate
+            # AdamW multiplies by (1 − lr · decay).
+            group["weight_decay"] = self.weight_decay / learning_rate if learning_rate > 0 else 0.0
+
+    def step(self, loss: th.Tensor) -> th.Tensor:
+        """Descend ``loss``; other parameters in its graph receive no gradient.
+
+        :param loss: scalar
+        :return: the gradient's global norm before the bound, a detached scalar
+        """
+        grads = th.autograd.grad(loss, self.parameters)
+        for parameter, grad in zip(self.parameters, grads, strict=True):
+            # Fused Adam reads raw memory: a gradient laid out channels-last would be applied to the wrong weights.
+            parameter.grad = grad.contiguous()
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+        return norm
+
+    def state_dict(self) -> dict[str, Any]:
+        """Adam's moments and settings."""
+        return self.adam.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what :meth:`state_dict` gave."""
+        self.adam.load_state_dict(state)

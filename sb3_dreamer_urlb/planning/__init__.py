@@ -1,0 +1,32 @@
+"""Planners that act through ``predict()``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_dreamer_urlb.planning.dyna_mpc import DynaMPC, PlannableModel, PlannerConfig
+
+#: What each planner's name changes in the configuration. MPPI trusts rewards only: no critic, no actor proposals.
+PLANNERS: dict[str, dict[str, Any]] = {"dyna_mpc": {}, "mppi": {"use_value": False, "mixture": 0.0}}
+
+
+def make_planner(name: str | None, kwargs: dict[str, Any] | None, gae_lambda: float) -> DynaMPC | None:
+    """Build the planner that a user asked for.
+
+    :param name: a key of ``PLANNERS``, or None to act with the actor
+    :param kwargs: fields of :class:`PlannerConfig` to change
+    :param gae_lambda: λ of the critic
+    :raises ValueError: for an unknown name, an unknown field or a value out of range
+    """
+    if name is None:
+        return None
+    if name not in PLANNERS:
+        raise ValueError(f"Unknown planner {name!r}; known are {sorted(PLANNERS)} and None for the actor.")
+    fields = {**PLANNERS[name], **(kwargs or {})}
+    unknown = sorted(set(fields) - set(PlannerConfig.__dataclass_fields__))
+    if unknown:
+        raise ValueError(f"Unknown planner_kwargs {unknown}; known are {sorted(PlannerConfig.__dataclass_fields__)}.")
+    return DynaMPC(PlannerConfig(**fields), gae_lambda)
+
+
+__all__ = ["PLANNERS", "DynaMPC", "PlannableModel", "PlannerConfig", "make_planner"]

@@ -1,0 +1,116 @@
+"""The few things that travel between the parts of the agent.
+
+Symbols used everywhere: B sequences a batch, T steps a sequence, N = B·T start states, H imagination horizon,
+A action size, D deterministic size, S·K stochastic size (S categoricals of K classes), F = S·K + D feature size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch as th
+
+Metrics = dict[str, th.Tensor]
+
+
+@dataclass
+class SequenceBatch:
+    """B sequences of T rows. Row t holds observation t with the action and the reward that *led to* it.
+
+    :param observation: images, uint8 (B, T, C, height, width)
+    :param action: float32 (B, T, A) in [-1, 1]; zeros in an episode's first row
+    :param reward: float32 (B, T); zero in an episode's first row
+    :param is_first: bool (B, T), true for an episode's first row; the first row of every chunk counts as one
+    :param is_terminal: bool (B, T), true where the environment terminated (not where it was truncated)
+    """
+
+    observation: th.Tensor
+    action: th.Tensor
+    reward: th.Tensor
+    is_first: th.Tensor
+    is_terminal: th.Tensor
+
+
+@dataclass
+class LatentState:
+    """The model state z of the paper: a stochastic and a deterministic part, both with the same leading shape.
+
+    :param stoch: float (…, S·K), S one-hot vectors one after the other
+    :param deter: float (…, D), the recurrent state h of the GRU
+    """
+
+    stoch: th.Tensor
+    deter: th.Tensor
+
+    @property
+    def feature(self) -> th.Tensor:
+        """What every head reads: [stochastic, deterministic], float (…, F)."""
+        return th.cat([self.stoch, self.deter], -1)
+
+    def detach(self) -> LatentState:
+        """The same state, cut from the graph."""
+        return LatentState(self.stoch.detach(), self.deter.detach())
+
+    def masked(self, keep: th.Tensor) -> LatentState:
+        """Zero the state where an episode begins.
+
+        :param keep: (…, 1), 1 to keep a row and 0 to reset it
+        """
+        return LatentState(self.stoch * keep, self.deter * keep)
+
+    def repeat(self, times: int) -> LatentState:
+        """Each row ``times`` times in a row: (n, …) → (n·times, …)."""
+        return LatentState(self.stoch.repeat_interleave(times, 0), self.deter.repeat_interleave(times, 0))
+
+    def flatten(self) -> LatentState:
+        """All leading dimensions as one: (B, T, …) → (B·T, …)."""
+        return LatentState(self.stoch.flatten(0, -2), self.deter.flatten(0, -2))
+
+
+@dataclass
+class Posterior:
+    """What the world model inferred about a replayed batch.
+
+    :param state: posterior states, (B, T, …)
+    :param feature: float (B, T, F), the features of ``state``
+    :param embed: encoded observations, float (B, T, E)
+    :param post_logits: float (B, T, S, K)
+    :param prior_logits: float (B, T, S, K)
+    :param kl: KL(posterior ‖ prior) in nats, float (B, T)
+    """
+
+    state: LatentState
+    feature: th.Tensor
+    embed: th.Tensor
+    post_logits: th.Tensor
+    prior_logits: th.Tensor
+    kl: th.Tensor
+
+
+@dataclass
+class Imagination:
+    """Trajectories dreamt by the actor inside the model, time first.
+
+    :param feature: float (H + 1, N, F) of z_0 … z_H; z_0 is where the dream starts
+    :param action: float (H + 1, N, A); action t led to state t, so the first is zero
+    :param entropy: of the actor at z_0 … z_{H-1} in nats, float (H, N)
+    """
+
+    feature: th.Tensor
+    action: th.Tensor
+    entropy: th.Tensor
+
+
+@dataclass(frozen=True)
+class ModelSizes:
+    """Sizes that a head or an intrinsic reward needs to know.
+
+    :param action: A, :param embed: E, :param feature: F, :param deter: D
+    :param net_arch: widths of the hidden layers of every head, actor and critic
+    """
+
+    action: int
+    embed: int
+    feature: int
+    deter: int
+    net_arch: tuple[int, ...]

@@ -1,0 +1,132 @@
+"""The recurrent state-space model: prior p(z_t | z_{t-1}, a_{t-1}) and posterior q(z_t | z_{t-1}, a_{t-1}, e_t)."""
+
+from __future__ import annotations
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.types import LatentState
+
+
+class RSSM(nn.Module):
+    """Discrete latent dynamics of DreamerV2 (paper §2 "World models", spec/algorithms §1).
+
+    :param action_size: A
+    :param embed_size: E
+    :param deter_size: D, the GRU's state
+    :param hidden_size: width of the layers around the GRU
+    :param stoch_variables: S categoricals
+    :param stoch_classes: K classes each
+    """
+
+    def __init__(
+        self, action_size: int, embed_size: int, deter_size: int, hidden_size: int, stoch_variables: int, stoch_classes: int
+    ):
+        super().__init__()
+        self.deter_size = deter_size
+        self.logits_shape = (stoch_variables, stoch_classes)
+        self.stoch_size = stoch_variables * stoch_classes
+        self.input = nn.Linear(self.stoch_size + action_size, hidden_size)
+        self.gru = nn.Linear(hidden_size + deter_size, 3 * deter_size)
+        self.gru_norm = nn.LayerNorm(3 * deter_size)
+        self.prior_hidden = nn.Linear(deter_size, hidden_size)
+        self.prior_logits = nn.Linear(hidden_size, self.stoch_size)
+        self.post_hidden = nn.Linear(deter_size + embed_size, hidden_size)
+        self.post_logits = nn.Linear(hidden_size, self.stoch_size)
+
+    def initial(self, n: int) -> LatentState:
+        """The zero state that every episode starts from.
+
+        :param n: number of states
+        """
+        like = self.input.weight
+        return LatentState(like.new_zeros(n, self.stoch_size), like.new_zeros(n, self.deter_size))
+
+    # -- the two steps ------------------------------------------------------------------------------------------------
+
+    def prior_step(self, state: LatentState, action: th.Tensor, generator: th.Generator | None = None) -> LatentState:
+        """Imagine the next state.
+
+        :param state: z_{t-1}, (n, …)
+        :param action: a_{t-1}, float (n, A)
+        :param generator: source of randomness
+        :return: a sample of z_t, (n, …)
+        """
+        deter = self._recur(state, self._action_part(action))
+        return LatentState(self._sample(self._prior(deter), generator), deter)
+
+    def posterior_step(
+        self,
+        state: LatentState,
+        action: th.Tensor,
+        embed: th.Tensor,
+        is_first: th.Tensor,
+        generator: th.Generator | None = None,
+    ) -> LatentState:
+        """Infer the current state from the observation; used for acting.
+
+        :param state: z_{t-1}, (n, …)
+        :param action: a_{t-1}, float (n, A)
+        :param embed: e_t, float (n, E)
+        :param is_first: bool (n,), true where an episode begins: state and action are zeroed there
+        :param generator: source of randomness
+        """
+        keep = (~is_first).to(embed.dtype).unsqueeze(-1)
+        deter = self._recur(state.masked(keep), self._action_part(action * keep))
+        return LatentState(self._sample(self._posterior(deter, self._embed_part(embed)), generator), deter)
+
+    def observe(self, embed: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> tuple[LatentState, th.Tensor, th.Tensor]:
+        """Infer the states of replayed sequences.
+
+        Whatever does not depend on the recurrence is one product over all steps: the action part of the input layer,
+        the embedding part of the posterior, and all prior logits. In the loop stay the input layer, GRU and posterior.
+
+        :param embed: float (B, T, E)
+        :param action: float (B, T, A), the action that led to each step
+        :param is_first: bool (B, T)
+        :return: posterior states (B, T, …), posterior logits and prior logits, float (B, T, S, K)
+        """
+        keep = (~is_first).to(embed.dtype).unsqueeze(-1)
+        action_parts = self._action_part(action * keep).unbind(1)
+        embed_parts = self._embed_part(embed).unbind(1)
+        state = self.initial(embed.shape[0])
+        stochs, deters, logits = [], [], []
+        for action_part, embed_part, keep_t in zip(action_parts, embed_parts, keep.unbind(1), strict=True):
+            deter = self._recur(state.masked(keep_t), action_part)
+            post_logits = self._posterior(deter, embed_part)
+            state = LatentState(self._sample(post_logits), deter)
+            stochs.append(state.stoch)
+            deters.append(deter)
+            logits.append(post_logits)
+        deter = th.stack(deters, 1)
+        return LatentState(th.stack(stochs, 1), deter), th.stack(logits, 1), self._prior(deter)
+
+    # -- their pieces -------------------------------------------------------------------------------------------------
+
+    def _action_part(self, action: th.Tensor) -> th.Tensor:
+        return F.linear(action, self.input.weight[:, self.stoch_size :], self.input.bias)
+
+    def _embed_part(self, embed: th.Tensor) -> th.Tensor:
+        return F.linear(embed, self.post_hidden.weight[:, self.deter_size :], self.post_hidden.bias)
+
+    def _recur(self, state: LatentState, action_part: th.Tensor) -> th.Tensor:
+        x = F.elu(F.linear(state.stoch, self.input.weight[:, : self.stoch_size]) + action_part)
+        parts = self.gru_norm(self.gru(th.cat([x, state.deter], -1)))
+        reset, candidate, update = parts.chunk(3, -1)
+        candidate = th.tanh(th.sigmoid(reset) * candidate)
+        # The bias of −1 makes a fresh GRU forget slowly (DreamerV2).
+        return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
+
+    def _prior(self, deter: th.Tensor) -> th.Tensor:
+        logits = self.prior_logits(F.elu(self.prior_hidden(deter)))
+        return logits.view(deter.shape[:-1] + self.logits_shape)
+
+    def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
+        hidden = F.elu(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
+        return self.post_logits(hidden).view(deter.shape[:-1] + self.logits_shape)
+
+    @staticmethod
+    def _sample(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+        return distributions.sample_one_hot(logits, generator).flatten(-2)

@@ -1,0 +1,146 @@
+"""The world model: what the agent learns from images, with or without rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import torch as th
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.distributions import BoundedNormal
+from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Posterior, SequenceBatch
+from sb3_dreamer_urlb.world_model.decoder import ConvDecoder
+from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
+from sb3_dreamer_urlb.world_model.rssm import RSSM
+
+
+class Acts(Protocol):
+    """Anything that turns features into an action distribution."""
+
+    def __call__(self, feature: th.Tensor) -> BoundedNormal: ...
+
+
+class WorldModel(nn.Module):
+    """Encoder, RSSM, decoder and reward head of DreamerV2; a discount head where episodes can terminate.
+
+    :param image_shape: (channels, height, width)
+    :param action_size: A
+    :param cnn_depth: channels of the first convolution
+    :param deter_size: D
+    :param hidden_size: width of the layers around the GRU
+    :param stoch_variables: S
+    :param stoch_classes: K
+    :param net_arch: hidden layers of the heads
+    :param gamma: discount factor of a state that does not terminate
+    :param discount_head: learn which states terminate
+    """
+
+    def __init__(
+        self,
+        image_shape: tuple[int, int, int],
+        action_size: int,
+        cnn_depth: int,
+        deter_size: int,
+        hidden_size: int,
+        stoch_variables: int,
+        stoch_classes: int,
+        net_arch: Sequence[int],
+        gamma: float,
+        discount_head: bool,
+    ):
+        super().__init__()
+        self.gamma = gamma
+        self.encoder = ConvEncoder(image_shape, cnn_depth)
+        embed = self.encoder.embed_size
+        self.rssm = RSSM(action_size, embed, deter_size, hidden_size, stoch_variables, stoch_classes)
+        feature = self.rssm.stoch_size + deter_size
+        self.decoder = ConvDecoder(feature, image_shape, cnn_depth)
+        self.reward = MLP(feature, net_arch)
+        self.discount_logit = MLP(feature, net_arch) if discount_head else None
+        self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch))
+
+    @staticmethod
+    def preprocess(observation: th.Tensor) -> th.Tensor:
+        """uint8 images in [0, 255] → float32 in [-0.5, 0.5], same shape."""
+        return observation.to(th.float32) / 255.0 - 0.5
+
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def loss(
+        self, batch: SequenceBatch, free_nats: float, kl_balance: float, reward_trains_model: bool
+    ) -> tuple[th.Tensor, Posterior, Metrics]:
+        """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
+
+        :param batch: what was replayed, (B, T, …)
+        :param free_nats: the KL below which the model is not pushed; applied to the batch mean
+        :param kl_balance: share of the KL's gradient that trains the prior
+        :param reward_trains_model: False stops the reward head's gradient before the model (pre-training)
+        :return: loss (scalar), the posterior with its graph, and metrics (detached scalars)
+        """
+        image = self.preprocess(batch.observation)
+        posterior = self.observe(image, batch.action, batch.is_first)
+        kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
+        image_nll = distributions.image_nll(self.decoder(posterior.feature), image)
+        reward_feature = posterior.feature if reward_trains_model else posterior.feature.detach()
+        reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), batch.reward).mean()
+        loss = kl_loss + image_nll + reward_nll
+        metrics = {"kl_loss": kl_loss, "image_loss": image_nll, "reward_loss": reward_nll, "kl": posterior.kl.mean()}
+        if self.discount_logit is not None:
+            goes_on = (~batch.is_terminal).to(image.dtype)
+            discount_nll = distributions.bernoulli_nll(self.discount_logit(posterior.feature), goes_on).mean()
+            loss = loss + discount_nll
+            metrics["discount_loss"] = discount_nll
+        with th.no_grad():
+            metrics["prior_entropy"] = distributions.categorical_entropy(posterior.prior_logits).mean()
+            metrics["posterior_entropy"] = distributions.categorical_entropy(posterior.post_logits).mean()
+        return loss, posterior, {name: value.detach() for name, value in metrics.items()}
+
+    def observe(self, image: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> Posterior:
+        """Infer the states behind sequences of images.
+
+        :param image: float in [-0.5, 0.5], (B, T, C, height, width)
+        :param action: float (B, T, A), the action that led to each image
+        :param is_first: bool (B, T)
+        """
+        embed = self.encoder(image)
+        state, post_logits, prior_logits = self.rssm.observe(embed, action, is_first)
+        with th.no_grad():
+            kl = distributions.categorical_kl(post_logits, prior_logits)
+        return Posterior(state, state.feature, embed, post_logits, prior_logits, kl)
+
+    @staticmethod
+    def _kl_loss(posterior: Posterior, free_nats: float, kl_balance: float) -> th.Tensor:
+        post, prior = posterior.post_logits, posterior.prior_logits
+        train_post = distributions.categorical_kl(post, prior.detach()).mean()
+        train_prior = distributions.categorical_kl(post.detach(), prior).mean()
+        return (1 - kl_balance) * train_post.clamp(min=free_nats) + kl_balance * train_prior.clamp(min=free_nats)
+
+    # -- dreaming ------------------------------------------------------------------------------------------------------
+
+    def imagine(self, actor: Acts, start: LatentState, horizon: int) -> Imagination:
+        """Let the actor act inside the model (paper §2; gradients flow through the dynamics to its actions).
+
+        :param actor: sees features cut from the graph
+        :param start: where the dreams begin, (N, …)
+        :param horizon: H, number of steps
+        """
+        state = start
+        action = start.deter.new_zeros(start.deter.shape[0], self.sizes.action)
+        features, actions, entropies = [state.feature], [action], []
+        for _ in range(horizon):
+            policy = actor(features[-1].detach())
+            action = policy.sample()
+            state = self.rssm.prior_step(state, action)
+            features.append(state.feature)
+            actions.append(action)
+            entropies.append(policy.entropy())
+        return Imagination(th.stack(features), th.stack(actions), th.stack(entropies))
+
+    def discount(self, feature: th.Tensor) -> th.Tensor:
+        """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…)."""
+        if self.discount_logit is None:
+            return th.full_like(feature[..., 0], self.gamma)
+        return self.gamma * th.sigmoid(self.discount_logit(feature))
