@@ -1,0 +1,140 @@
+"""Checks of what users hand in: one clear error, before any time is spent."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import TYPE_CHECKING, Any
+
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
+from sb3_dreamer_urlb.planning import make_planner
+from sb3_dreamer_urlb.policies import check_image_space
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+# smallest allowed value of each integer argument
+INTEGERS = {
+    "buffer_size": 1,
+    "learning_starts": 0,
+    "batch_size": 1,
+    "batch_length": 2,
+    "imagination_horizon": 2,
+    "planner_delay": 0,
+    "target_update_interval": 1,
+}
+# open or closed ranges of each number: (low, low allowed, high, high allowed)
+NUMBERS = {
+    "gamma": (0.0, False, 1.0, True),
+    "gae_lambda": (0.0, True, 1.0, True),
+    "kl_balance": (0.0, True, 1.0, True),
+    "free_nats": (0.0, True, math.inf, False),
+    "adam_eps": (0.0, False, math.inf, False),
+    "max_grad_norm": (0.0, False, math.inf, True),
+    "weight_decay": (0.0, True, 1.0, False),
+}
+#: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
+SHORT_EPISODES = 50
+
+
+def check(model: DreamerV2) -> None:
+    """Everything that can be known to be wrong before the networks are built.
+
+    :raises ValueError: naming the argument, its value and what was expected
+    """
+    for name, least in INTEGERS.items():
+        value = getattr(model, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
+    for name, (low, low_ok, high, high_ok) in NUMBERS.items():
+        value = getattr(model, name)
+        inside = isinstance(value, (int, float)) and (
+            low < value < high or (low_ok and value == low) or (high_ok and value == high)
+        )
+        if not inside:
+            bounds = f"{'[' if low_ok else '('}{low:g}, {high:g}{']' if high_ok else ')'}"
+            raise ValueError(f"{name} must lie in {bounds}, got {value!r}.")
+    frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
+    if not isinstance(frequency, int) or frequency < 1:
+        raise ValueError(f"train_freq must be a positive integer, or such a one with its unit, got {model.train_freq!r}.")
+    if not isinstance(model.gradient_steps, int) or model.gradient_steps < -1:
+        raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
+    if model.ent_coef is not None and not (isinstance(model.ent_coef, (int, float)) and 0 <= model.ent_coef < math.inf):
+        raise ValueError(f"ent_coef must be a non-negative number or None, got {model.ent_coef!r}.")
+    if model.batch_length > model.buffer_size:
+        raise ValueError(f"batch_length={model.batch_length} must not exceed buffer_size={model.buffer_size}.")
+    for name in ("learning_rate", "actor_learning_rate", "critic_learning_rate"):
+        value = getattr(model, name)
+        if not callable(value) and not (isinstance(value, (int, float)) and 0 <= value < math.inf):
+            raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+    _check_names(model)
+    _check_spaces(model)
+    if model.env is not None:
+        _check_episode_fits(model.env, model.batch_length)
+
+
+def _check_names(model: DreamerV2) -> None:
+    method = model.intrinsic_reward
+    if isinstance(method, str):
+        get_intrinsic_reward(method)
+    elif method is not None and not (isinstance(method, type) and issubclass(method, IntrinsicReward)):
+        raise ValueError(f"intrinsic_reward must be a name, a subclass of IntrinsicReward or None, got {method!r}.")
+    make_planner(model.planner, model.planner_kwargs, model.gae_lambda)
+    buffer_class = model.replay_buffer_class
+    if buffer_class is not None and not issubclass(buffer_class, SequenceReplayBuffer):
+        raise ValueError(
+            f"replay_buffer_class must be a SequenceReplayBuffer, got {buffer_class.__name__}: "
+            "a world model learns from sequences, so SB3's transition buffers and HER do not apply."
+        )
+
+
+def _check_spaces(model: DreamerV2) -> None:
+    check_image_space(model.observation_space)
+    if not isinstance(model.action_space, spaces.Box):
+        raise ValueError(f"DreamerV2 needs a Box action space, got {model.action_space}.")
+
+
+def _check_episode_fits(env: VecEnv, batch_length: int) -> None:
+    steps = env_attribute(env, "max_episode_steps", None)
+    if steps is None:
+        steps = getattr(env_attribute(env, "spec", None), "max_episode_steps", None)
+    # An episode has one row more than steps: the reset's.
+    if steps is not None and steps + 1 < batch_length:
+        raise ValueError(
+            f"batch_length={batch_length} is longer than any episode: the environment ends them after {steps} steps."
+        )
+
+
+def check_episode_length(buffer: SequenceReplayBuffer) -> None:
+    """Stop a run whose episodes are all too short to learn from.
+
+    :raises ValueError: after ``SHORT_EPISODES`` of them
+    """
+    if buffer.finished_count >= SHORT_EPISODES:
+        raise ValueError(
+            f"batch_length={buffer.batch_length} is longer than any of the first {buffer.finished_count} episodes "
+            f"(the longest had {buffer.longest} rows): choose a smaller batch_length."
+        )
+
+
+def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
+    """An attribute of the first environment, through all wrappers; ``default`` where there is none."""
+    try:
+        return env.get_attr(name, indices=0)[0]
+    except AttributeError:
+        return default
+
+
+def check_load_keywords(algorithm: type[DreamerV2], kwargs: dict[str, Any]) -> None:
+    """SB3 would silently set any keyword as an attribute.
+
+    :raises TypeError: for a keyword that is no constructor argument, or one that only makes sense there
+    """
+    known = set(inspect.signature(algorithm.__init__).parameters) - {"self", "policy", "env", "preset", "_init_setup_model"}
+    unknown = sorted(set(kwargs) - known)
+    if unknown:
+        raise TypeError(f"load() got unknown keywords {unknown}; known are {sorted(known)}.")

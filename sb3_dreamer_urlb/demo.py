@@ -1,0 +1,139 @@
+"""The demonstration: pre-train with LBS, fine-tune with Dyna-MPC, and show what came of it, in minutes on two CPU cores."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.evaluation import figures
+from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
+from sb3_dreamer_urlb.evaluation.scores import ORACLE
+from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
+
+
+@dataclass
+class DemoConfig:
+    """What the demonstration does; the defaults fit into 15 minutes on two cores.
+
+    :param out: folder that everything is written to
+    :param task: fine-tuning task, ``<domain>-<task>``; the pre-training never sees its reward
+    :param pretrain_frames: environment frames of pre-training
+    :param finetune_frames: environment frames of fine-tuning
+    :param episodes: evaluation episodes
+    :param seed: of everything random
+    :param preset: of the model
+    :param fast_render: cheaper shadows
+    """
+
+    out: Path = Path("demo_output")
+    task: str = "walker-stand"
+    pretrain_frames: int = 5000
+    finetune_frames: int = 5000
+    episodes: int = 5
+    seed: int = 0
+    preset: str = "small"
+    fast_render: bool = True
+
+
+class EpisodeRecorder(BaseCallback):
+    """Remembers the return of every training episode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.points: list[figures.CurvePoint] = []
+
+    def _on_step(self) -> bool:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                frames = self.num_timesteps * model.action_repeat
+                self.points.append(figures.CurvePoint(frames, model.phase, info["episode"]["r"]))
+        return True
+
+
+def run_demo(config: DemoConfig) -> dict[str, float]:
+    """Run everything, write the pictures, print the table.
+
+    :param config: what to do
+    :return: mean returns of ``"fine-tuned agent"``, ``"random policy"`` and ``"oracle"``
+    :raises ValueError: for a task that has no oracle score
+    :raises ImportError: if the extra ``plots`` is missing
+    """
+    if config.task not in ORACLE:
+        raise ValueError(f"Unknown task {config.task!r}; known are {sorted(ORACLE)}.")
+    figures.check_plots_installed()
+    began = time.time()
+    config.out.mkdir(parents=True, exist_ok=True)
+    # Networks this small gain nothing from more threads, and lose much when another program uses the other core.
+    th.set_num_threads(1)
+
+    env = gymnasium.make(f"urlb/{config.task}-v0", fast_render=config.fast_render, render_mode="rgb_array")
+    model, recorder = _train(config, env)
+    returns = evaluate(model, env, config.episodes)
+    random_returns = evaluate(RandomPolicy(env.action_space, config.seed), env, config.episodes)
+    result = {
+        "fine-tuned agent": float(np.mean(returns)),
+        "random policy": float(np.mean(random_returns)),
+        "oracle": ORACLE[config.task],
+    }
+    _draw(config, model, env, recorder, result)
+    env.close()
+    _print_table(config, result, returns, random_returns, time.time() - began)
+    return result
+
+
+def _train(config: DemoConfig, env: gymnasium.Env) -> tuple[DreamerV2, EpisodeRecorder]:
+    model = DreamerV2(
+        "CnnPolicy",
+        env,
+        intrinsic_reward="lbs",
+        planner="dyna_mpc",
+        preset=config.preset,
+        seed=config.seed,
+        tensorboard_log=str(config.out / "tensorboard"),
+    )
+    recorder = EpisodeRecorder()
+    callbacks = [
+        recorder,
+        SnapshotCallback(config.out, frames=[config.pretrain_frames], name_prefix="pretrained"),
+        PhaseSwitchCallback(config.pretrain_frames),
+    ]
+    steps = -(-(config.pretrain_frames + config.finetune_frames) // model.action_repeat)
+    print(f"Pre-training with LBS for {config.pretrain_frames} frames, then {config.finetune_frames} frames of {config.task}.")
+    model.learn(steps, callback=callbacks, log_interval=1, tb_log_name="demo", progress_bar=True)
+    model.save(config.out / "finetuned.zip")
+    return model, recorder
+
+
+def _draw(
+    config: DemoConfig, model: DreamerV2, env: gymnasium.Env, recorder: EpisodeRecorder, result: dict[str, float]
+) -> None:
+    levels = {"evaluation after fine-tuning": result["fine-tuned agent"], "random policy": result["random policy"]}
+    title = f"{config.task}: LBS pre-training, then fine-tuning with Dyna-MPC"
+    figures.learning_curve(recorder.points, levels, title, config.out / "learning_curve.png")
+    episode = play_episode(model, env, seed=config.seed, render=True)
+    fps = env.get_wrapper_attr("metadata")["render_fps"]
+    # Every second picture: half the size, same speed.
+    figures.write_gif(episode.frames[:300:2], config.out / "agent.gif", fps / 2)
+    truth, predicted = figures.open_loop(model.policy, episode, start=50, steps=45)
+    figures.write_gif(figures.truth_model_error(truth, predicted), config.out / "open_loop.gif", fps / 2, scale=3)
+
+
+def _print_table(
+    config: DemoConfig, result: dict[str, float], returns: list[float], random_returns: list[float], seconds: float
+) -> None:
+    spread = {"fine-tuned agent": np.std(returns), "random policy": np.std(random_returns)}
+    print(f"\n{config.task}, seed {config.seed}: mean return of {config.episodes} episodes (± standard deviation)")
+    for name, value in result.items():
+        note = f"± {spread[name]:.0f}" if name in spread else "Dreamer trained for 2M frames (paper, appendix A)"
+        print(f"  {name:<18}{value:>6.0f}  {note}")
+    print(f"{seconds / 60:.1f} minutes. Written to {config.out}/:")
+    for path in sorted(config.out.iterdir()):
+        print(f"  {path.name}{'/' if path.is_dir() else ''}")

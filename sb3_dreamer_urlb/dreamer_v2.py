@@ -1,0 +1,500 @@
+"""DreamerV2 as a Stable-Baselines3 algorithm: SB3's contract, nothing of the model."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_dreamer_urlb import arguments, phases
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
+from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.planning import make_planner
+from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
+from sb3_dreamer_urlb.presets import with_preset
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.types import Metrics
+
+SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
+
+
+class DreamerV2(OffPolicyAlgorithm):
+    """DreamerV2 with unsupervised pre-training, task-aware fine-tuning and Dyna-MPC.
+
+    "Mastering the Unsupervised Reinforcement Learning Benchmark from Pixels" (ICML 2023). With an ``intrinsic_reward``
+    the model starts in the *pre-training* phase: the environment's rewards are logged but drive nothing. Without one it
+    learns the task at once. :meth:`fine_tune`, or a :class:`~sb3_dreamer_urlb.PhaseSwitchCallback`, moves on to
+    fine-tuning. All defaults are the paper's.
+
+    Units: ``learning_starts``, ``train_freq``, ``planner_delay`` and ``buffer_size`` count *agent steps*, as everywhere in
+    SB3; ``phase_frames`` counts environment frames (agent steps × action repeat), as in the paper.
+
+    :param policy: ``"CnnPolicy"``
+    :param env: environment, vectorised or not, or its id; image observations, Box actions
+    :param learning_rate: of the world model and the intrinsic reward; a number or a schedule
+    :param actor_learning_rate: number or schedule
+    :param critic_learning_rate: number or schedule
+    :param buffer_size: rows of replay to keep
+    :param learning_starts: agent steps in each phase before its first update
+    :param batch_size: B, sequences a batch
+    :param batch_length: T, rows a sequence
+    :param imagination_horizon: H, steps dreamt from every replayed state
+    :param gamma: discount factor
+    :param gae_lambda: λ of the returns
+    :param train_freq: update after this many steps (of the vectorised environment)
+    :param gradient_steps: updates each time; -1 for as many as steps were taken
+    :param intrinsic_reward: name of a method (``"lbs"``), a subclass of
+        :class:`~sb3_dreamer_urlb.IntrinsicReward`, or None to learn the task
+    :param planner: ``"dyna_mpc"``, ``"mppi"`` or None; acts in fine-tuning, also in ``predict``
+    :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`
+    :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
+    :param ent_coef: weight of the actor's entropy; None: 0 while exploring, 1e-4 on a task
+    :param free_nats: the KL that costs nothing
+    :param kl_balance: share of the KL's gradient that trains the prior
+    :param target_update_interval: updates between two copies of the critic to the slow critic
+    :param adam_eps: ε of all optimisers
+    :param max_grad_norm: bound of each optimiser's gradient norm
+    :param weight_decay: every weight is multiplied by (1 − this) in each step
+    :param discount_head: learn which states terminate; None: yes unless the environment says that it never does
+    :param action_noise: SB3's, added to actions while training
+    :param replay_buffer_class: None for :class:`~sb3_dreamer_urlb.SequenceReplayBuffer`, or a subclass of it
+    :param replay_buffer_kwargs: further arguments of it
+    :param policy_kwargs: sizes of the networks, see :class:`~sb3_dreamer_urlb.DreamerPolicy`
+    :param stats_window_size: episodes that rollout statistics average over
+    :param tensorboard_log: folder of TensorBoard logs
+    :param verbose: 0 quiet, 1 info, 2 debug
+    :param seed: of everything random
+    :param device: "auto", "cpu", "cuda"
+    :param preset: ``"paper"``, ``"small"`` (two CPU cores) or ``"tiny"`` (tests); replaces defaults, never what you write
+    :param _init_setup_model: build the networks now
+    :raises ValueError: for arguments or spaces that do not fit, before anything is built
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy}
+    policy: DreamerPolicy
+    policy_class: type[DreamerPolicy]
+    replay_buffer: SequenceReplayBuffer
+    learner: Learner
+
+    @with_preset
+    def __init__(
+        self,
+        policy: str | type[DreamerPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        actor_learning_rate: float | Schedule = 8e-5,
+        critic_learning_rate: float | Schedule = 8e-5,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 2000,
+        batch_size: int = 50,
+        batch_length: int = 50,
+        imagination_horizon: int = 15,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        train_freq: int | tuple[int, str] = 5,
+        gradient_steps: int = 1,
+        intrinsic_reward: str | type[IntrinsicReward] | None = None,
+        planner: str | None = None,
+        planner_kwargs: dict[str, Any] | None = None,
+        planner_delay: int = 500,
+        ent_coef: float | None = None,
+        free_nats: float = 1.0,
+        kl_balance: float = 0.8,
+        target_update_interval: int = 100,
+        adam_eps: float = 1e-5,
+        max_grad_norm: float = 100.0,
+        weight_decay: float = 1e-6,
+        discount_head: bool | None = None,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[SequenceReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        preset: str = "paper",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+        )
+        self.actor_learning_rate = actor_learning_rate
+        self.critic_learning_rate = critic_learning_rate
+        self.batch_length = batch_length
+        self.imagination_horizon = imagination_horizon
+        self.gae_lambda = gae_lambda
+        self.intrinsic_reward = intrinsic_reward
+        self.planner = planner
+        self.planner_kwargs = planner_kwargs
+        self.planner_delay = planner_delay
+        self.ent_coef = ent_coef
+        self.free_nats = free_nats
+        self.kl_balance = kl_balance
+        self.target_update_interval = target_update_interval
+        self.adam_eps = adam_eps
+        self.max_grad_norm = max_grad_norm
+        self.weight_decay = weight_decay
+        self.discount_head = discount_head
+        self.preset = preset
+
+        #: name of the phase; with its own counters, which ``learn`` never resets
+        self.phase = phases.FINETUNING if intrinsic_reward is None else phases.PRETRAINING
+        self.phase_timesteps = 0
+        self.phase_updates = 0
+        #: environment frames an agent step
+        self.action_repeat = 1
+
+        if _init_setup_model:
+            self._setup_model()
+
+    # -- set-up --------------------------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
+        self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        arguments.check(self)
+        self._convert_train_freq()
+        self._read_env()
+        self.set_random_seed(self.seed)
+        self._build()
+
+    def _read_env(self) -> None:
+        """What the environment tells about itself beyond its spaces."""
+        if self.env is None:
+            return
+        self.action_repeat = int(arguments.env_attribute(self.env, "action_repeat", 1))
+        if self.discount_head is None:
+            self.discount_head = not arguments.env_attribute(self.env, "never_terminates", False)
+
+    def _build(self) -> None:
+        """Fresh networks, optimisers and replay for the current phase."""
+        method = self.intrinsic_reward if phases.PHASES[self.phase].explores else None
+        intrinsic = get_intrinsic_reward(method) if isinstance(method, str) else method
+        self.policy = self.policy_class(
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            gamma=self.gamma,
+            discount_head=bool(self.discount_head),
+            intrinsic=intrinsic,
+            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda),
+            **self.policy_kwargs,
+        ).to(self.device)
+        self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
+        self.learner.updates = self.phase_updates
+        if getattr(self, "replay_buffer", None) is None:
+            self.replay_buffer = self._new_replay_buffer()
+        self._acting_state: ActingState | None = None
+        self._metrics: list[Metrics] = []
+
+    def _learner_config(self, intrinsic: type[IntrinsicReward] | None) -> LearnerConfig:
+        return LearnerConfig(
+            learning_rate=self.lr_schedule(1),
+            actor_learning_rate=self._actor_lr_schedule(1),
+            critic_learning_rate=self._critic_lr_schedule(1),
+            adam_eps=self.adam_eps,
+            max_grad_norm=self.max_grad_norm,
+            weight_decay=self.weight_decay,
+            free_nats=self.free_nats,
+            kl_balance=self.kl_balance,
+            imagination_horizon=self.imagination_horizon,
+            gae_lambda=self.gae_lambda,
+            target_update_interval=self.target_update_interval,
+            ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
+            reward_trains_model=not phases.PHASES[self.phase].explores,
+        )
+
+    def _new_replay_buffer(self) -> SequenceReplayBuffer:
+        buffer_class: Any = self.replay_buffer_class or SequenceReplayBuffer
+        return buffer_class(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            **{"batch_length": self.batch_length, "seed": self.seed, "phase": self.phase, **self.replay_buffer_kwargs},
+        )
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}.")
+        return self.policy_aliases[policy_name]
+
+    # -- phases --------------------------------------------------------------------------------------------------------
+
+    @property
+    def phase_frames(self) -> int:
+        """Environment frames seen in the current phase: agent steps × action repeat."""
+        return self.phase_timesteps * self.action_repeat
+
+    def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
+        """Leave pre-training: what ``phases.TRANSFER`` keeps stays, everything else starts afresh (paper §3).
+
+        The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
+
+        :param env: the fine-tuning environment; None stays in the same one
+        :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
+        :param keep_critic: for ablations
+        :raises ValueError: if the model is not pre-training
+        """
+        if self.phase != phases.PRETRAINING:
+            raise ValueError(f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}.")
+        if env is not None:
+            self.set_env(env)
+        if keep_actor is None:
+            keep_actor = phases.keeps_actor(None if self.env is None else arguments.env_attribute(self.env, "domain", None))
+        pretrained = self.policy.agent
+        self.phase, self.phase_timesteps, self.phase_updates = phases.FINETUNING, 0, 0
+        del self.replay_buffer
+        self._build()
+        phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
+        self._last_obs = None
+
+    def restart_episodes(self) -> None:
+        """Reset all environments in the middle of ``learn``, because they changed."""
+        assert self.env is not None
+        self.replay_buffer.close_streams()
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.env.num_envs, bool)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """As SB3's; also reads the new environment's action repeat."""
+        super().set_env(env, force_reset)
+        self._read_env()
+
+    # -- acting --------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """See :meth:`DreamerPolicy.predict`; plans if a planner is set and its time has come."""
+        self.policy.planning = self._planner_is_on()
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def _planner_is_on(self) -> bool:
+        due = self.phase_timesteps >= self.learning_starts + self.planner_delay
+        return self.planner is not None and phases.PHASES[self.phase].plans and due
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One step of the recurrent agent; what it remembers is the action *as executed*."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        assert isinstance(observation, th.Tensor)
+        state = self._acting_state or self.policy.initial_state(n_envs)
+        self.policy.planning = self._planner_is_on()
+        with th.no_grad():
+            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
+            if phases.PHASES[self.phase].random_warmup and self.phase_timesteps < learning_starts:
+                uniform = np.stack([self.action_space.sample() for _ in range(n_envs)])
+                scaled = self.policy.scale_action(uniform).reshape(n_envs, -1)
+            else:
+                state = self.policy.choose(state, deterministic=False)
+                scaled = state.action.cpu().numpy()
+        if action_noise is not None:
+            scaled = np.clip(scaled + action_noise().reshape(n_envs, -1), -1, 1)
+        scaled = scaled.astype(np.float32)
+        state.action = th.as_tensor(scaled, device=self.device)
+        self._acting_state = state
+        self.phase_timesteps += n_envs
+        return self.policy.to_env_action(scaled), scaled
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if not np.isfinite(reward).all():
+            bad = int(np.flatnonzero(~np.isfinite(reward))[0])
+            raise ValueError(
+                f"Environment {bad} gave the reward {reward[bad]} at step {self.num_timesteps}; expected a finite one."
+            )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        # SB3's off-policy base never updates this; the recurrent state needs it.
+        self._last_episode_starts = dones.astype(bool)
+
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfDreamerV2,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "DreamerV2",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfDreamerV2:
+        """Collect and learn for ``total_timesteps`` agent steps; as SB3's, but warm-ups count by phase, not by call.
+
+        :param total_timesteps: agent steps
+        :param callback: SB3 callback(s)
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the TensorBoard run
+        :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
+        :param progress_bar: show one
+        """
+        total_timesteps, callbacks = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callbacks.on_training_start(locals(), globals())
+        assert self.env is not None and isinstance(self.train_freq, TrainFreq)
+        while self.num_timesteps < total_timesteps:
+            rollout = self.collect_rollouts(
+                self.env,
+                callbacks,
+                self.train_freq,
+                self.replay_buffer,
+                self.action_noise,
+                self.learning_starts,
+                log_interval,
+            )
+            if not rollout.continue_training:
+                break
+            # SB3 gates on num_timesteps, which every learn() resets.
+            if self.phase_timesteps > self.learning_starts:
+                steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
+                self.train(steps, self.batch_size)
+        callbacks.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            # The environments are about to be reset.
+            self.replay_buffer.close_streams()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """Update on replayed sequences; does nothing while no finished episode is long enough.
+
+        :param gradient_steps: number of updates
+        :param batch_size: B
+        """
+        if not self.replay_buffer.can_sample():
+            arguments.check_episode_length(self.replay_buffer)
+            return
+        self.policy.set_training_mode(True)
+        self._set_learning_rates()
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            self._metrics.append(self.learner.update(batch))
+        self._n_updates += gradient_steps
+        self.phase_updates = self.learner.updates
+
+    def _set_learning_rates(self) -> None:
+        remaining = self._current_progress_remaining
+        rates = {"actor_optimizer": self._actor_lr_schedule, "critic_optimizer": self._critic_lr_schedule}
+        for name, optimizer in self.learner.optimizers().items():
+            optimizer.set_learning_rate(rates.get(name, self.lr_schedule)(remaining))
+        self.logger.record("train/learning_rate", self.lr_schedule(remaining))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def dump_logs(self) -> None:
+        """Write the log; the only place where metrics leave the device."""
+        if self._metrics:
+            names = list(self._metrics[0])
+            means = th.stack([th.stack([metrics[name] for name in names]) for metrics in self._metrics]).mean(0).tolist()
+            for name, value in zip(names, means, strict=True):
+                self.logger.record(f"train/{name}", value)
+            self._metrics = []
+        self.logger.record("time/phase", self.phase, exclude="tensorboard")
+        self.logger.record("time/phase_frames", self.phase_frames)
+        super().dump_logs()
+
+    # -- saving --------------------------------------------------------------------------------------------------------
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "learner", "_acting_state", "_metrics"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
+        return ["policy", *optimizers], []
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfDreamerV2],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfDreamerV2:
+        """Load a snapshot; as SB3's, but an unknown keyword is an error.
+
+        :param path: of the ``.zip``, or a file object
+        :param env: environment to go on in
+        :param device: where to put the networks
+        :param custom_objects: see SB3
+        :param print_system_info: see SB3
+        :param force_reset: see SB3
+        :param kwargs: constructor arguments to change
+        :raises TypeError: for a keyword that is no constructor argument
+        """
+        arguments.check_load_keywords(cls, kwargs)
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        return model
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Go on with a saved replay buffer.
+
+        :param path: what ``save_replay_buffer`` wrote
+        :param truncate_last_traj: part of SB3's interface; open episodes are always ended
+        :raises ValueError: if it was filled in another phase
+        """
+        previous = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        if self.replay_buffer.phase != self.phase:
+            loaded, self.replay_buffer = self.replay_buffer.phase, previous
+            raise ValueError(f"The replay buffer was filled in the phase {loaded!r}, the model is in {self.phase!r}.")
+        self.replay_buffer.close_streams()

@@ -1,0 +1,118 @@
+"""Pictures of a run: learning curve, open-loop prediction, the agent at work. Needs the extra ``plots``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch as th
+
+from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
+from sb3_dreamer_urlb.policies import DreamerPolicy
+
+MISSING_PLOTS = "Pictures need matplotlib and pillow: pip install 'sb3_dreamer_urlb[plots]'."
+CONTEXT = 5  # observations the model sees before it predicts on its own
+
+
+def check_plots_installed() -> None:
+    """
+    :raises ImportError: if the extra ``plots`` is not installed, saying how to install it
+    """
+    try:
+        import matplotlib  # noqa: F401
+        import PIL  # noqa: F401
+    except ImportError as error:
+        raise ImportError(MISSING_PLOTS) from error
+
+
+@dataclass
+class CurvePoint:
+    """Return of one training episode.
+
+    :param frames: environment frames since the run began
+    :param phase: in which it was played
+    :param episode_return: undiscounted
+    """
+
+    frames: int
+    phase: str
+    episode_return: float
+
+
+def learning_curve(points: Sequence[CurvePoint], levels: dict[str, float], title: str, path: str | os.PathLike[str]) -> None:
+    """Episode returns over frames, one colour a phase, with horizontal lines to compare with.
+
+    :param points: the training episodes in their order
+    :param levels: label → return of each line
+    :param title: above the picture
+    :param path: of the PNG
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4), constrained_layout=True)
+    for phase, color in (("pretraining", "tab:gray"), ("finetuning", "tab:blue")):
+        chosen = [point for point in points if point.phase == phase]
+        axes.plot([p.frames for p in chosen], [p.episode_return for p in chosen], "o-", color=color, label=phase, ms=4)
+    for (label, value), style in zip(levels.items(), ("-", "--", ":", "-."), strict=False):
+        axes.axhline(value, color="tab:red", linestyle=style, linewidth=1, label=f"{label}: {value:.0f}")
+    axes.set(xlabel="environment frames", ylabel="episode return", title=title, ylim=(0, None))
+    axes.legend(loc="upper left", fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+@th.no_grad()
+def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the model thinks happens: it sees a few frames, then only the actions.
+
+    :param policy: whose world model predicts
+    :param episode: what really happened
+    :param start: first observation that the model sees
+    :param steps: predicted steps
+    :return: truth and prediction, both uint8 (CONTEXT + steps, height, width, C)
+    """
+    model, device = policy.agent.world_model, policy.device
+    end = min(start + CONTEXT + steps, len(episode.observations))
+    truth = episode.observations[start:end]
+    scaled = policy.scale_action(episode.actions.reshape(len(episode.actions), *policy.action_space.shape))  # type: ignore[misc]
+    # Row t holds the action that led to observation t.
+    led = np.concatenate([np.zeros_like(scaled[:1]), scaled])[start:end].reshape(len(truth), -1)
+    action = th.as_tensor(led, dtype=th.float32, device=device)
+    image = model.preprocess(th.as_tensor(truth, device=device).permute(0, 3, 1, 2)).unsqueeze(0)
+    is_first = th.zeros(1, CONTEXT, dtype=th.bool, device=device)
+    is_first[:, 0] = True
+    seen = model.observe(image[:, :CONTEXT], action[None, :CONTEXT], is_first)
+    features = list(seen.feature[0].unbind(0))
+    state = type(seen.state)(seen.state.stoch[:, -1], seen.state.deter[:, -1])
+    for t in range(CONTEXT, len(truth)):
+        state = model.rssm.prior_step(state, action[None, t])
+        features.append(state.feature[0])
+    decoded = (model.decoder(th.stack(features)) + 0.5).clamp(0, 1) * 255
+    return truth, decoded.permute(0, 2, 3, 1).round().to(th.uint8).cpu().numpy()
+
+
+def truth_model_error(truth: np.ndarray, model: np.ndarray) -> np.ndarray:
+    """Three pictures side by side: truth, model, and their difference around grey, uint8 (n, height, 3·width, C)."""
+    error = (truth.astype(np.int16) - model.astype(np.int16)) // 2 + 128
+    return np.concatenate([truth, model, error.astype(np.uint8)], 2)
+
+
+def write_gif(frames: Sequence[np.ndarray] | np.ndarray, path: str | os.PathLike[str], fps: float, scale: int = 1) -> None:
+    """Write an animation.
+
+    :param frames: uint8 (height, width, 3) each
+    :param path: of the GIF
+    :param fps: frames a second
+    :param scale: enlarge each pixel this many times
+    """
+    from PIL import Image
+
+    pictures = [Image.fromarray(np.ascontiguousarray(frame)) for frame in frames]
+    size = (pictures[0].width * scale, pictures[0].height * scale)
+    pictures = [picture.resize(size, Image.Resampling.NEAREST) for picture in pictures]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0)

@@ -1,0 +1,88 @@
+"""Playing episodes: what evaluations, figures and the demo share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.type_aliases import PolicyPredictor
+
+
+class RandomPolicy:
+    """Uniformly random actions, behind the interface of a model.
+
+    :param action_space: Box
+    :param seed: of the draws
+    """
+
+    def __init__(self, action_space: gymnasium.Space, seed: int = 0):
+        self.action_space = action_space
+        self.action_space.seed(seed)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """One action for one observation."""
+        return self.action_space.sample(), None
+
+
+@dataclass
+class PlayedEpisode:
+    """One episode as it was played.
+
+    :param observations: uint8 (steps + 1, height, width, C)
+    :param actions: as the environment received them, float (steps, A)
+    :param total_reward: undiscounted return
+    :param frames: large pictures, uint8, empty unless asked for
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    total_reward: float
+    frames: list[np.ndarray] = field(default_factory=list)
+
+
+def play_episode(
+    model: PolicyPredictor, env: gymnasium.Env, seed: int | None = None, deterministic: bool = True, render: bool = False
+) -> PlayedEpisode:
+    """Play one episode, with the model's memory threaded through.
+
+    :param model: anything with SB3's ``predict``
+    :param env: one environment, not vectorised
+    :param seed: of the episode
+    :param deterministic: handed to ``predict``
+    :param render: also keep ``env.render()`` after each step
+    """
+    observation, _ = env.reset(seed=seed)
+    observations, actions, frames = [observation], [], []
+    state: Any = None
+    total, done = 0.0, False
+    start = np.ones(1, bool)
+    while not done:
+        action, state = model.predict(observation, state, start, deterministic)
+        start = np.zeros(1, bool)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        done = terminated or truncated
+        total += float(reward)
+        observations.append(observation)
+        actions.append(action)
+        if render:
+            frames.append(np.asarray(env.render()))
+    return PlayedEpisode(np.stack(observations), np.stack(actions), total, frames)
+
+
+def evaluate(model: PolicyPredictor, env: gymnasium.Env, episodes: int, seed: int = 1000) -> list[float]:
+    """Returns of ``episodes`` episodes with fixed seeds, the same for everyone that is compared.
+
+    :param model: anything with SB3's ``predict``
+    :param env: one environment, not vectorised
+    :param episodes: how many
+    :param seed: of the first; the others follow
+    """
+    return [play_episode(model, env, seed=seed + i).total_reward for i in range(episodes)]
