@@ -1,19 +1,34 @@
 """A Stable-Baselines3-style DreamerV2 for the Unsupervised RL Benchmark, from pixels.
 
-Importing the package registers the environments ``urlb/<domain>-<task>-v0``.
+Importing the package registers the environments ``urlb/<domain>-<task>-v0``. The public names load on first use, so that
+who only wants an environment does not wait for torch, and the command line can still choose how torch's threads wait.
 """
 
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs import register_envs
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
-from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
-from sb3_dreamer_urlb.planning import PlannerConfig
-from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
-from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
-register_envs()
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+    from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
+    from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
+    from sb3_dreamer_urlb.planning import PlannerConfig
+    from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
+    from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+_MODULES = {
+    "CnnPolicy": "policies",
+    "DreamerPolicy": "policies",
+    "DreamerV2": "dreamer_v2",
+    "IntrinsicReward": "intrinsic",
+    "PhaseSwitchCallback": "phases",
+    "PlannerConfig": "planning",
+    "SequenceReplayBuffer": "replay",
+    "SnapshotCallback": "phases",
+    "register_intrinsic_reward": "intrinsic",
+}
 
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
@@ -29,3 +44,15 @@ __all__ = [
     "register_envs",
     "register_intrinsic_reward",
 ]
+
+register_envs()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

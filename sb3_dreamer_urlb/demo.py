@@ -8,7 +8,6 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -71,8 +70,6 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     figures.check_plots_installed()
     began = time.time()
     config.out.mkdir(parents=True, exist_ok=True)
-    # Networks this small gain nothing from more threads, and lose much when another program uses the other core.
-    th.set_num_threads(1)
 
     env = gymnasium.make(f"urlb/{config.task}-v0", fast_render=config.fast_render, render_mode="rgb_array")
     model, recorder = _train(config, env)

@@ -224,6 +224,7 @@ def check_updates(case: Case, worst: Worst) -> None:
 
         def spying_weights(discount, seen=seen):  # type: ignore[no-untyped-def]
             weight = weights(discount)
+            # The file also holds the weight of z_H, which no loss uses.
             seen["weights"] = th.cat([weight, weight[-1:] * discount[-2:-1]])
             return weight
 
@@ -238,7 +239,7 @@ def check_updates(case: Case, worst: Worst) -> None:
         ):
             metrics = case.learner.update(case.batch(update))
         for name, theirs in case.named(f"update{update}.imagination."):
-            worst.relative("imagination", seen[name].flatten()[: theirs.size], theirs)
+            worst.relative("imagination", seen[name], theirs)
         for name, theirs in case.named(f"update{update}.metric."):
             if name not in UNLOGGED:
                 worst.relative("losses", metrics[METRICS[name]], theirs)

@@ -6,7 +6,8 @@ from typing import Any
 
 from sb3_dreamer_urlb.planning.dyna_mpc import DynaMPC, PlannableModel, PlannerConfig
 
-#: What each planner's name changes in the configuration. MPPI trusts rewards only: no critic, no actor proposals.
+#: What each planner's name settles in the configuration, whatever preset or user say about these fields. MPPI trusts
+#: rewards only: no critic, no actor proposals.
 PLANNERS: dict[str, dict[str, Any]] = {"dyna_mpc": {}, "mppi": {"use_value": False, "mixture": 0.0}}
 
 
@@ -14,7 +15,7 @@ def make_planner(name: str | None, kwargs: dict[str, Any] | None, gae_lambda: fl
     """Build the planner that a user asked for.
 
     :param name: a key of ``PLANNERS``, or None to act with the actor
-    :param kwargs: fields of :class:`PlannerConfig` to change
+    :param kwargs: fields of :class:`PlannerConfig` to change; those that the name settles are ignored
     :param gae_lambda: λ of the critic
     :raises ValueError: for an unknown name, an unknown field or a value out of range
     """
@@ -22,7 +23,7 @@ def make_planner(name: str | None, kwargs: dict[str, Any] | None, gae_lambda: fl
         return None
     if name not in PLANNERS:
         raise ValueError(f"Unknown planner {name!r}; known are {sorted(PLANNERS)} and None for the actor.")
-    fields = {**PLANNERS[name], **(kwargs or {})}
+    fields = {**(kwargs or {}), **PLANNERS[name]}
     unknown = sorted(set(fields) - set(PlannerConfig.__dataclass_fields__))
     if unknown:
         raise ValueError(f"Unknown planner_kwargs {unknown}; known are {sorted(PlannerConfig.__dataclass_fields__)}.")

@@ -151,13 +151,13 @@ class DynaMPC:
 
     def _actor_proposals(self, model: PlannableModel, state: LatentState, generator: th.Generator | None) -> th.Tensor:
         """Action sequences of the actor, imagined once and used in every iteration: float (n, P, H, A)."""
-        count, horizon = self.config.actor_trajectories, self.config.horizon
+        n, count, horizon = state.deter.shape[0], self.config.actor_trajectories, self.config.horizon
         state = state.repeat(count)
         actions = [model.act(state.feature, generator)]
         for _ in range(horizon - 1):
             state = model.step(state, actions[-1], generator)
             actions.append(model.act(state.feature, generator))
-        return th.stack(actions, 1).view(-1, count, horizon, actions[0].shape[-1])
+        return th.stack(actions, 1).view(n, count, horizon, actions[0].shape[-1])
 
     # -- the Gaussian --------------------------------------------------------------------------------------------------
 
