@@ -7,9 +7,12 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
+from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import check_image_space
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
@@ -37,6 +40,18 @@ NUMBERS = {
     "max_grad_norm": (0.0, False, math.inf, True),
     "weight_decay": (0.0, True, 1.0, False),
 }
+#: arguments of the policy that the algorithm fills in itself
+POLICY_ARGUMENTS_OF_THE_MODEL = {
+    "self",
+    "observation_space",
+    "action_space",
+    "lr_schedule",
+    "gamma",
+    "discount_head",
+    "intrinsic",
+    "planner",
+    "planning",
+}
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
 
@@ -48,30 +63,29 @@ def check(model: DreamerV2) -> None:
     """
     for name, least in INTEGERS.items():
         value = getattr(model, name)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        if not is_integer(value) or value < least:
             raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
     for name, (low, low_ok, high, high_ok) in NUMBERS.items():
         value = getattr(model, name)
-        inside = isinstance(value, (int, float)) and (
-            low < value < high or (low_ok and value == low) or (high_ok and value == high)
-        )
+        inside = is_number(value) and (low < value < high or (low_ok and value == low) or (high_ok and value == high))
         if not inside:
             bounds = f"{'[' if low_ok else '('}{low:g}, {high:g}{']' if high_ok else ')'}"
             raise ValueError(f"{name} must lie in {bounds}, got {value!r}.")
     frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
-    if not isinstance(frequency, int) or frequency < 1:
+    if not is_integer(frequency) or frequency < 1:
         raise ValueError(f"train_freq must be a positive integer, or such a one with its unit, got {model.train_freq!r}.")
-    if not isinstance(model.gradient_steps, int) or model.gradient_steps < -1:
+    if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
         raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
-    if model.ent_coef is not None and not (isinstance(model.ent_coef, (int, float)) and 0 <= model.ent_coef < math.inf):
+    if model.ent_coef is not None and not (is_finite_number(model.ent_coef) and model.ent_coef >= 0):
         raise ValueError(f"ent_coef must be a non-negative number or None, got {model.ent_coef!r}.")
     if model.batch_length > model.buffer_size:
         raise ValueError(f"batch_length={model.batch_length} must not exceed buffer_size={model.buffer_size}.")
     for name in ("learning_rate", "actor_learning_rate", "critic_learning_rate"):
         value = getattr(model, name)
-        if not callable(value) and not (isinstance(value, (int, float)) and 0 <= value < math.inf):
+        if not callable(value) and not (is_finite_number(value) and value >= 0):
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
     _check_names(model)
+    _check_policy_kwargs(model)
     _check_spaces(model)
     if model.env is not None:
         _check_episode_fits(model.env, model.batch_length)
@@ -83,19 +97,70 @@ def _check_names(model: DreamerV2) -> None:
         get_intrinsic_reward(method)
     elif method is not None and not (isinstance(method, type) and issubclass(method, IntrinsicReward)):
         raise ValueError(f"intrinsic_reward must be a name, a subclass of IntrinsicReward or None, got {method!r}.")
+    if method is None and PHASES[model.phase].explores:
+        raise ValueError(
+            f"A model in the phase {model.phase!r} needs an intrinsic_reward, got None: to move on to the task, "
+            "load it as it is and call fine_tune()."
+        )
     make_planner(model.planner, model.planner_kwargs, model.gae_lambda)
     buffer_class = model.replay_buffer_class
-    if buffer_class is not None and not issubclass(buffer_class, SequenceReplayBuffer):
+    if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):
         raise ValueError(
-            f"replay_buffer_class must be a SequenceReplayBuffer, got {buffer_class.__name__}: "
+            f"replay_buffer_class must be a subclass of SequenceReplayBuffer, got {buffer_class!r}: "
             "a world model learns from sequences, so SB3's transition buffers and HER do not apply."
         )
 
 
+def _check_policy_kwargs(model: DreamerV2) -> None:
+    known = set(inspect.signature(model.policy_class.__init__).parameters) - POLICY_ARGUMENTS_OF_THE_MODEL
+    unknown = sorted(set(model.policy_kwargs) - known)
+    if unknown:
+        raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")
+
+
 def _check_spaces(model: DreamerV2) -> None:
+    if getattr(model, "observation_space", None) is None:
+        raise ValueError("DreamerV2 needs an environment: env is None.")
     check_image_space(model.observation_space)
-    if not isinstance(model.action_space, spaces.Box):
-        raise ValueError(f"DreamerV2 needs a Box action space, got {model.action_space}.")
+    space = model.action_space
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"DreamerV2 needs a Box action space, got {space}.")
+    if not (space.low < space.high).all():
+        raise ValueError(f"Every action dimension needs low < high, got {space} with low={space.low}, high={space.high}.")
+
+
+def check_env(model: DreamerV2, env: VecEnv) -> None:
+    """Whether a model can go on in another environment.
+
+    :param model: with its spaces
+    :param env: vectorised
+    :raises AssertionError: for another number of environments, as SB3's ``set_env``
+    :raises ValueError: for other spaces, or episodes shorter than a sequence
+    """
+    if env.num_envs != model.n_envs:
+        raise AssertionError(
+            f"The number of environments differs from the model's: {env.num_envs} != {model.n_envs}. "
+            "To change it, load a snapshot with the new ones: DreamerV2.load(path, env=...)."
+        )
+    check_for_correct_spaces(env, model.observation_space, model.action_space)
+    _check_episode_fits(env, model.batch_length)
+
+
+def check_replay_buffer(model: DreamerV2, buffer: Any) -> None:
+    """Whether a loaded replay buffer belongs to a model like this.
+
+    :raises ValueError: naming what differs
+    """
+    if not isinstance(buffer, SequenceReplayBuffer):
+        raise ValueError(f"The file holds no SequenceReplayBuffer but {type(buffer).__name__}.")
+    if buffer.phase != model.phase:
+        raise ValueError(f"The replay buffer was filled in the phase {buffer.phase!r}, the model is in {model.phase!r}.")
+    for name in ("n_envs", "batch_length"):
+        if getattr(buffer, name) != getattr(model, name):
+            raise ValueError(f"The replay buffer has {name}={getattr(buffer, name)}, the model {getattr(model, name)}.")
+    for name in ("observation_space", "action_space"):
+        if getattr(buffer, name) != getattr(model, name):
+            raise ValueError(f"The replay buffer's {name} is {getattr(buffer, name)}, the model's {getattr(model, name)}.")
 
 
 def _check_episode_fits(env: VecEnv, batch_length: int) -> None:

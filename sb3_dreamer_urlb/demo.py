@@ -29,6 +29,7 @@ class DemoConfig:
     :param seed: of everything random
     :param preset: of the model
     :param fast_render: cheaper shadows
+    :raises ValueError: for a task that has no oracle score, or a number that is not positive
     """
 
     out: Path = Path("demo_output")
@@ -39,6 +40,13 @@ class DemoConfig:
     seed: int = 0
     preset: str = "small"
     fast_render: bool = True
+
+    def __post_init__(self) -> None:
+        if self.task not in ORACLE:
+            raise ValueError(f"Unknown task {self.task!r}; known are {sorted(ORACLE)}.")
+        for name in ("pretrain_frames", "finetune_frames", "episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
 
 
 class EpisodeRecorder(BaseCallback):
@@ -62,11 +70,8 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
 
     :param config: what to do
     :return: mean returns of ``"fine-tuned agent"``, ``"random policy"`` and ``"oracle"``
-    :raises ValueError: for a task that has no oracle score
     :raises ImportError: if the extra ``plots`` is missing
     """
-    if config.task not in ORACLE:
-        raise ValueError(f"Unknown task {config.task!r}; known are {sorted(ORACLE)}.")
     figures.check_plots_installed()
     began = time.time()
     config.out.mkdir(parents=True, exist_ok=True)

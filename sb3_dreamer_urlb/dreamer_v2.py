@@ -13,8 +13,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import arguments, phases
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
@@ -23,7 +25,7 @@ from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-from sb3_dreamer_urlb.types import Metrics
+from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
 
@@ -172,8 +174,12 @@ class DreamerV2(OffPolicyAlgorithm):
         self.phase = phases.FINETUNING if intrinsic_reward is None else phases.PRETRAINING
         self.phase_timesteps = 0
         self.phase_updates = 0
+        #: environment frames seen in the phase: agent steps × action repeat
+        self.phase_frames = 0
         #: environment frames an agent step
         self.action_repeat = 1
+        #: of the environment's task, None where it does not tell
+        self.domain: str | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -195,11 +201,14 @@ class DreamerV2(OffPolicyAlgorithm):
         if self.env is None:
             return
         self.action_repeat = int(arguments.env_attribute(self.env, "action_repeat", 1))
+        self.domain = arguments.env_attribute(self.env, "domain", None)
         if self.discount_head is None:
             self.discount_head = not arguments.env_attribute(self.env, "never_terminates", False)
 
     def _build(self) -> None:
         """Fresh networks, optimisers and replay for the current phase."""
+        if getattr(self, "replay_buffer", None) is None:
+            self.replay_buffer = self._new_replay_buffer()
         method = self.intrinsic_reward if phases.PHASES[self.phase].explores else None
         intrinsic = get_intrinsic_reward(method) if isinstance(method, str) else method
         self.policy = self.policy_class(
@@ -214,10 +223,8 @@ class DreamerV2(OffPolicyAlgorithm):
         ).to(self.device)
         self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
         self.learner.updates = self.phase_updates
-        if getattr(self, "replay_buffer", None) is None:
-            self.replay_buffer = self._new_replay_buffer()
         self._acting_state: ActingState | None = None
-        self._metrics: list[Metrics] = []
+        self._metrics = MetricMeans()
 
     def _learner_config(self, intrinsic: type[IntrinsicReward] | None) -> LearnerConfig:
         return LearnerConfig(
@@ -254,11 +261,6 @@ class DreamerV2(OffPolicyAlgorithm):
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    @property
-    def phase_frames(self) -> int:
-        """Environment frames seen in the current phase: agent steps × action repeat."""
-        return self.phase_timesteps * self.action_repeat
-
     def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
         """Leave pre-training: what ``phases.TRANSFER`` keeps stays, everything else starts afresh (paper §3).
 
@@ -274,9 +276,10 @@ class DreamerV2(OffPolicyAlgorithm):
         if env is not None:
             self.set_env(env)
         if keep_actor is None:
-            keep_actor = phases.keeps_actor(None if self.env is None else arguments.env_attribute(self.env, "domain", None))
+            keep_actor = phases.keeps_actor(self.domain)
         pretrained = self.policy.agent
-        self.phase, self.phase_timesteps, self.phase_updates = phases.FINETUNING, 0, 0
+        self.phase = phases.FINETUNING
+        self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
         del self.replay_buffer
         self._build()
         phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
@@ -288,12 +291,25 @@ class DreamerV2(OffPolicyAlgorithm):
         self.replay_buffer.close_streams()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, bool)
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
+    def prepare_env(self, env: GymEnv) -> VecEnv:
+        """Wrap an environment as SB3 does, and check that this model can go on in it.
+
+        :param env: vectorised or not
+        :raises ValueError: if it does not fit
+        """
+        wrapped = self._wrap_env(env, self.verbose)
+        arguments.check_env(self, wrapped)
+        return wrapped
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As SB3's; also reads the new environment's action repeat."""
-        super().set_env(env, force_reset)
+        """As SB3's; also checks that episodes are long enough, and reads the new environment's action repeat.
+
+        :param env: with the model's number of environments and its spaces
+        :param force_reset: reset it before going on
+        :raises ValueError: if it does not fit; the model stays as it is
+        """
+        super().set_env(self.prepare_env(env), force_reset)
         self._read_env()
 
     # -- acting --------------------------------------------------------------------------------------------------------
@@ -336,6 +352,7 @@ class DreamerV2(OffPolicyAlgorithm):
         state.action = th.as_tensor(scaled, device=self.device)
         self._acting_state = state
         self.phase_timesteps += n_envs
+        self.phase_frames += n_envs * self.action_repeat
         return self.policy.to_env_action(scaled), scaled
 
     def _store_transition(
@@ -347,13 +364,21 @@ class DreamerV2(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        """As SB3's, but images are never normalised, and the recurrent state needs to know where episodes begin."""
+        if self._vec_normalize_env is not None:
+            reward = self._vec_normalize_env.get_original_reward()
         if not np.isfinite(reward).all():
             bad = int(np.flatnonzero(~np.isfinite(reward))[0])
             raise ValueError(
                 f"Environment {bad} gave the reward {reward[bad]} at step {self.num_timesteps}; expected a finite one."
             )
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        # SB3's off-policy base never updates this; the recurrent state needs it.
+        # The VecEnv has already begun the next episode: put the true last observation back.
+        next_obs = np.array(new_obs)
+        for i in np.flatnonzero(dones):
+            next_obs[i] = infos[i].get("terminal_observation", next_obs[i])
+        assert isinstance(self._last_obs, np.ndarray)
+        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos)
+        self._last_obs = new_obs
         self._last_episode_starts = dones.astype(bool)
 
     # -- learning ------------------------------------------------------------------------------------------------------
@@ -426,12 +451,13 @@ class DreamerV2(OffPolicyAlgorithm):
         self._set_learning_rates()
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            self._metrics.append(self.learner.update(batch))
+            self._metrics.add(self.learner.update(batch))
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
 
     def _set_learning_rates(self) -> None:
-        remaining = self._current_progress_remaining
+        # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.
+        remaining = max(self._current_progress_remaining, 0.0)
         rates = {"actor_optimizer": self._actor_lr_schedule, "critic_optimizer": self._critic_lr_schedule}
         for name, optimizer in self.learner.optimizers().items():
             optimizer.set_learning_rate(rates.get(name, self.lr_schedule)(remaining))
@@ -440,12 +466,8 @@ class DreamerV2(OffPolicyAlgorithm):
 
     def dump_logs(self) -> None:
         """Write the log; the only place where metrics leave the device."""
-        if self._metrics:
-            names = list(self._metrics[0])
-            means = th.stack([th.stack([metrics[name] for name in names]) for metrics in self._metrics]).mean(0).tolist()
-            for name, value in zip(names, means, strict=True):
-                self.logger.record(f"train/{name}", value)
-            self._metrics = []
+        for name, value in self._metrics.take().items():
+            self.logger.record(f"train/{name}", value)
         self.logger.record("time/phase", self.phase, exclude="tensorboard")
         self.logger.record("time/phase_frames", self.phase_frames)
         super().dump_logs()
@@ -483,6 +505,9 @@ class DreamerV2(OffPolicyAlgorithm):
         """
         arguments.check_load_keywords(cls, kwargs)
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        for optimizer in model.learner.optimizers().values():
+            # The loaded state carries the old settings; the arguments' are what the user asked for.
+            optimizer.restore_settings()
         return model
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
@@ -490,11 +515,10 @@ class DreamerV2(OffPolicyAlgorithm):
 
         :param path: what ``save_replay_buffer`` wrote
         :param truncate_last_traj: part of SB3's interface; open episodes are always ended
-        :raises ValueError: if it was filled in another phase
+        :raises ValueError: if it does not fit the model, or was filled in another phase; the model keeps its own then
         """
-        previous = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if self.replay_buffer.phase != self.phase:
-            loaded, self.replay_buffer = self.replay_buffer.phase, previous
-            raise ValueError(f"The replay buffer was filled in the phase {loaded!r}, the model is in {self.phase!r}.")
-        self.replay_buffer.close_streams()
+        buffer = load_from_pkl(path, self.verbose)
+        arguments.check_replay_buffer(self, buffer)
+        buffer.device = self.device
+        buffer.close_streams()
+        self.replay_buffer = buffer

@@ -23,13 +23,16 @@ class ClippedAdam:
         self, parameters: Iterable[nn.Parameter], learning_rate: float, eps: float, max_grad_norm: float, weight_decay: float
     ):
         self.parameters = list(parameters)
+        self.learning_rate = learning_rate
+        self.eps = eps
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
         self.adam = th.optim.AdamW(self.parameters, lr=learning_rate, eps=eps, weight_decay=0.0, fused=True)
         self.set_learning_rate(learning_rate)
 
     def set_learning_rate(self, learning_rate: float) -> None:
-        """Change the step size; the weight decay stays what it is."""
+        """Change the step size; the weight decay stays what it is (a step size of 0 stops both)."""
+        self.learning_rate = learning_rate
         for group in self.adam.param_groups:
             group["lr"] = learning_rate
             # AdamW multiplies by (1 − lr · decay).
@@ -49,6 +52,12 @@ class ClippedAdam:
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         return norm
+
+    def restore_settings(self) -> None:
+        """Put the settings back that loading Adam's state replaced."""
+        for group in self.adam.param_groups:
+            group["eps"] = self.eps
+        self.set_learning_rate(self.learning_rate)
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments and settings."""

@@ -94,7 +94,8 @@ class PhaseSwitchCallback(BaseCallback):
     :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
     :param keep_critic: for ablations
     :param verbose: 1 prints the switch
-    :raises ValueError: for a number of frames that is not positive
+    :raises ValueError: for a number of frames that is not positive, and, when ``learn`` begins, for an ``env`` that does
+        not fit the model
     """
 
     def __init__(
@@ -112,6 +113,13 @@ class PhaseSwitchCallback(BaseCallback):
         self.env = env
         self.keep_actor = keep_actor
         self.keep_critic = keep_critic
+
+    def _init_callback(self) -> None:
+        if self.env is None:
+            return
+        # Now, not after the 2M frames of pre-training.
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        self.env = model.prepare_env(self.env)
 
     def _on_step(self) -> bool:
         return True

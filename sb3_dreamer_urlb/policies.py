@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import DynaMPC
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
@@ -58,6 +59,7 @@ class DreamerPolicy(BasePolicy):
     :param discount_head: learn which states terminate
     :param intrinsic: class of the intrinsic reward, None for the task's
     :param planner: what acts instead of the actor while ``planning`` is true
+    :param planning: let the planner act
     :param normalize_images: part of SB3's interface; uint8 images are always scaled to [-0.5, 0.5]
     :raises ValueError: for spaces or sizes that do not fit
     """
@@ -77,6 +79,7 @@ class DreamerPolicy(BasePolicy):
         discount_head: bool = False,
         intrinsic: type[IntrinsicReward] | None = None,
         planner: DynaMPC | None = None,
+        planning: bool = True,
         normalize_images: bool = True,
     ):
         super().__init__(observation_space, action_space, normalize_images=normalize_images)
@@ -89,7 +92,7 @@ class DreamerPolicy(BasePolicy):
             "cnn_depth": cnn_depth,
         }
         for name, size in [*sizes.items(), *((f"net_arch[{i}]", width) for i, width in enumerate(net_arch))]:
-            if not isinstance(size, int) or size < 1:
+            if not is_integer(size) or size < 1:
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
         if len(net_arch) == 0:
             raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
@@ -103,12 +106,14 @@ class DreamerPolicy(BasePolicy):
         )
         self.agent = Agent(world_model, net_arch, intrinsic)
         self.planner = planner
-        self.planning = planner is not None
+        self.planning = planning
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         parameters = super()._get_constructor_parameters()
-        parameters.update(self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner)
+        parameters.update(
+            self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner, planning=self.planning
+        )
         parameters["intrinsic"] = None if self.agent.intrinsic is None else type(self.agent.intrinsic)
         return parameters
 
@@ -179,6 +184,8 @@ class DreamerPolicy(BasePolicy):
             raise ValueError("predict() takes the observation, got a tuple: Gymnasium's `obs, info = env.reset()`?")
         tensor, vectorized = self.obs_to_tensor(observation)
         assert isinstance(tensor, th.Tensor)
+        if tensor.dtype != th.uint8:
+            raise ValueError(f"Images must be uint8 in [0, 255], got {tensor.dtype}.")
         n = tensor.shape[0]
         memory = self.initial_state(n) if state is None else self._memory(state, n)
         starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)

@@ -114,3 +114,27 @@ class ModelSizes:
     feature: int
     deter: int
     net_arch: tuple[int, ...]
+
+
+class MetricMeans:
+    """Running means of metrics, on the device until somebody asks."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.total: th.Tensor | None = None
+        self.count = 0
+
+    def add(self, metrics: Metrics) -> None:
+        """Take one update's metrics in; all updates since the last :meth:`take` have the same names."""
+        values = th.stack(list(metrics.values()))
+        self.names = list(metrics)
+        self.total = values if self.total is None else self.total + values
+        self.count += 1
+
+    def take(self) -> dict[str, float]:
+        """The means since the last call, empty if there was no update. Waits for the device."""
+        if self.total is None:
+            return {}
+        means = dict(zip(self.names, (self.total / self.count).tolist(), strict=True))
+        self.__init__()  # type: ignore[misc]
+        return means

@@ -19,15 +19,14 @@ def make_planner(name: str | None, kwargs: dict[str, Any] | None, gae_lambda: fl
     :param gae_lambda: λ of the critic
     :raises ValueError: for an unknown name, an unknown field or a value out of range
     """
-    if name is None:
-        return None
-    if name not in PLANNERS:
+    if name is not None and name not in PLANNERS:
         raise ValueError(f"Unknown planner {name!r}; known are {sorted(PLANNERS)} and None for the actor.")
-    fields = {**(kwargs or {}), **PLANNERS[name]}
+    fields = {**(kwargs or {}), **PLANNERS.get(name or "", {})}
     unknown = sorted(set(fields) - set(PlannerConfig.__dataclass_fields__))
     if unknown:
         raise ValueError(f"Unknown planner_kwargs {unknown}; known are {sorted(PlannerConfig.__dataclass_fields__)}.")
-    return DynaMPC(PlannerConfig(**fields), gae_lambda)
+    config = PlannerConfig(**fields)
+    return None if name is None else DynaMPC(config, gae_lambda)
 
 
 __all__ = ["PLANNERS", "DynaMPC", "PlannableModel", "PlannerConfig", "make_planner"]

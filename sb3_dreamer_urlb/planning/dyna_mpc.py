@@ -12,6 +12,7 @@ import torch as th
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.behavior.returns import lambda_return
+from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
 from sb3_dreamer_urlb.types import LatentState
 
 MAX_STD = 2.0
@@ -64,8 +65,12 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         for name, least in (("horizon", 2), ("n_samples", 1), ("iterations", 1), ("top_k", 1)):
             value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
+            if not is_integer(value) or value < least:
                 raise ValueError(f"planner {name} must be an integer of at least {least}, got {value!r}.")
+        for name in ("mixture", "temperature", "momentum", "min_std"):
+            value = getattr(self, name)
+            if not is_finite_number(value):
+                raise ValueError(f"planner {name} must be a finite number, got {value!r}.")
         if not 0 <= self.mixture <= 1:
             raise ValueError(f"planner mixture must lie in [0, 1], got {self.mixture!r}.")
         if not 0 <= self.momentum < 1:

@@ -99,7 +99,8 @@ class SequenceReplayBuffer(ReplayBuffer):
             )
         self.buffer_size = buffer_size
         self.batch_length = batch_length
-        self.max_episode_rows = max_episode_rows
+        # A piece must fit into the buffer, or it would be all that is ever held.
+        self.max_episode_rows = min(max_episode_rows, buffer_size)
         self.phase = phase
         self.rng = np.random.default_rng(seed)
         self.reset()

@@ -1,0 +1,116 @@
+"""What several test files share: a cheap environment, tiny agents, and comparisons of weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch as th
+from fake_envs import CounterEnv
+from hypothesis import settings
+
+from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.intrinsic import get_intrinsic_reward
+from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.types import SequenceBatch
+from sb3_dreamer_urlb.world_model.world_model import WorldModel
+
+IMAGE, ACTIONS = (3, 16, 16), 2
+LEARNER = {
+    "learning_rate": 1e-3,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "adam_eps": 1e-5,
+    "max_grad_norm": 100.0,
+    "weight_decay": 1e-6,
+    "free_nats": 0.0,
+    "kl_balance": 0.8,
+    "imagination_horizon": 3,
+    "gae_lambda": 0.95,
+    "target_update_interval": 100,
+    "ent_coef": 0.0,
+    "reward_trains_model": True,
+}
+
+
+def pytest_configure() -> None:
+    """Tiny networks gain nothing from threads; hypothesis draws the same examples in every run."""
+    th.set_num_threads(1)
+    settings.register_profile("suite", deadline=None, derandomize=True, max_examples=25)
+    settings.load_profile("suite")
+
+
+@pytest.fixture
+def seeded() -> None:
+    """Fixed global torch randomness."""
+    th.manual_seed(0)
+
+
+@pytest.fixture
+def tiny_model() -> Callable[..., DreamerV2]:
+    """Make a tiny DreamerV2 on the counting environment, or on the one given."""
+
+    def make(env: Any = None, **kwargs: Any) -> DreamerV2:
+        env = CounterEnv() if env is None else env
+        return DreamerV2("CnnPolicy", env, **{"preset": "tiny", "seed": 0, "device": "cpu", **kwargs})
+
+    return make
+
+
+@pytest.fixture
+def world_model(seeded: None) -> Callable[..., WorldModel]:
+    """Make a tiny world model."""
+
+    def make(**kwargs: Any) -> WorldModel:
+        sizes = {
+            "image_shape": IMAGE,
+            "action_size": ACTIONS,
+            "cnn_depth": 2,
+            "deter_size": 8,
+            "hidden_size": 8,
+            "stoch_variables": 3,
+            "stoch_classes": 4,
+            "net_arch": [8],
+            "gamma": 0.99,
+            "discount_head": False,
+        }
+        return WorldModel(**{**sizes, **kwargs})
+
+    return make
+
+
+@pytest.fixture
+def learner(world_model: Callable[..., WorldModel]) -> Callable[..., Learner]:
+    """Make a learner with a tiny agent of its own."""
+
+    def make(intrinsic: str | None = None, discount_head: bool = False, **kwargs: Any) -> Learner:
+        method = None if intrinsic is None else get_intrinsic_reward(intrinsic)
+        agent = Agent(world_model(discount_head=discount_head), [8], method)
+        return Learner(agent, LearnerConfig(**{**LEARNER, **kwargs}))
+
+    return make
+
+
+@pytest.fixture
+def batch(seeded: None) -> SequenceBatch:
+    """Random rows, (B, T) = (3, 5)."""
+    lead = (3, 5)
+    is_first = th.zeros(lead, dtype=th.bool)
+    is_first[:, 0] = True
+    is_terminal = th.zeros(lead, dtype=th.bool)
+    is_terminal[0, -1] = True
+    observation = th.randint(0, 256, (*lead, *IMAGE), dtype=th.uint8)
+    return SequenceBatch(observation, th.rand(*lead, ACTIONS) * 2 - 1, th.rand(lead), is_first, is_terminal)
+
+
+def weights(module: th.nn.Module) -> dict[str, bytes]:
+    """A module's parameters and buffers, bit for bit."""
+    return {name: value.detach().cpu().numpy().tobytes() for name, value in module.state_dict().items()}
+
+
+@pytest.fixture(name="weights")
+def weights_fixture() -> Callable[[th.nn.Module], dict[str, bytes]]:
+    """:func:`weights`."""
+    return weights

@@ -1,0 +1,84 @@
+"""The authors' numbers, and that the comparison with them can fail."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import golden
+import numpy as np
+import pytest
+
+TESTS = Path(__file__).parent
+FILES = ["dreamer_finetune.npz", "lbs_pretrain.npz"]
+
+
+def golden_path(name: str) -> str:
+    """Of a golden file: in ``$SB3_DREAMER_GOLDEN`` if set, else beside the checkout, else the tests' copy."""
+    given = os.environ.get("SB3_DREAMER_GOLDEN")
+    folders = [Path(given)] if given else [TESTS.parent.parent / "shared" / "golden", TESTS / "golden"]
+    found = [folder / name for folder in folders if (folder / name).is_file()]
+    assert found, f"{name} lies in none of {[str(folder) for folder in folders]}"
+    return str(found[0])
+
+
+@pytest.fixture
+def changed(tmp_path):
+    """A function that copies a golden file with one array changed, and gives the copy's path."""
+
+    def change(key, function, name=FILES[1]):
+        with np.load(golden_path(name)) as archive:
+            data = {entry: archive[entry] for entry in archive.files}
+        data[key] = function(data[key].copy())
+        path = tmp_path / "changed.npz"
+        np.savez(path, **data)
+        return str(path)
+
+    return change
+
+
+def _nudge(array):
+    array.flat[0] += 0.1
+    return array
+
+
+def _nan(array):
+    array.flat[0] = np.nan
+    return array
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_equals_the_authors_implementation(name):
+    worst = golden.check(golden_path(name))
+    assert worst.passed(), dict(worst.errors)
+    assert {"forward", "imagination", "losses", "weights", "planner"} <= set(worst.errors)
+
+
+@pytest.mark.parametrize("change", [_nudge, _nan])
+@pytest.mark.parametrize("key", ["init.rssm.gru.weight", "forward.deter", "plan1.mean"])
+def test_a_changed_number_is_noticed(changed, key, change):
+    assert not golden.check(changed(key, change)).passed()
+
+
+def test_nan_among_the_last_weights_is_noticed(changed):
+    with np.load(golden_path(FILES[1])) as archive:
+        key = [name for name in archive.files if ".weights." in name][-1]
+    assert golden.check(changed(key, _nan)).errors["weights"] == float("inf")
+
+
+def test_a_wrong_shape_or_a_missing_weight_is_refused(changed):
+    with pytest.raises(ValueError, match="shape"):
+        golden.check(changed("forward.deter", lambda array: array[..., :-1]))
+    case = golden.Case(golden_path(FILES[1]))
+    case.data.pop("init.actor.out.bias")
+    with pytest.raises(ValueError, match="actor"):
+        case._load_weights()
+
+
+def test_exit_status(changed, capsys):
+    good, bad = golden_path(FILES[0]), changed("init.critic.out.bias", _nudge)
+    assert golden.main([good]) == 0
+    assert golden.main([bad, good]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["ok", "FAIL", "ok"]
+    assert golden.main([]) == 2

@@ -1,0 +1,247 @@
+"""The trap test: rows that know where they belong, so that a wrong one cannot hide (spec/reliability "Replay")."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
+
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+IMAGE = spaces.Box(0, 255, (1, 2, 2), np.uint8)
+ACTION = spaces.Box(-1, 1, (2,), np.float32)
+
+
+def picture(episode: int, t: int) -> np.ndarray:
+    """An image that tells its episode and its step."""
+    return np.array([episode % 256, episode // 256, t % 256, t // 256], np.uint8).reshape(1, 2, 2)
+
+
+class Streams:
+    """Feeds a buffer as SB3 does: lock-step, with the true last observation where an episode ends.
+
+    Rows of episode e: observation (e, t), action (e, t), reward e + t / 1000.
+
+    :param buffer: to feed
+    :param lengths: function giving the steps and the end ("terminal" or "truncated") of an episode
+    """
+
+    def __init__(self, buffer, lengths):
+        self.buffer, self.lengths = buffer, lengths
+        self.started = 0
+        #: (episode, rows, end) of finished episodes, in the order in which they ended
+        self.finished: list[tuple[int, int, str]] = []
+        self.now = [self._begin() for _ in range(buffer.n_envs)]
+
+    def _begin(self):
+        self.started += 1
+        return [self.started - 1, 0, *self.lengths(self.started - 1)]
+
+    def step(self):
+        n = len(self.now)
+        obs = np.stack([picture(e, t) for e, t, *_ in self.now])
+        for episode in self.now:
+            episode[1] += 1
+        next_obs = np.stack([picture(e, t) for e, t, *_ in self.now])
+        action = np.array([[e, t] for e, t, *_ in self.now], np.float32)
+        reward = np.array([e + t / 1000 for e, t, *_ in self.now], np.float32)
+        done = np.array([t == length for _, t, length, _ in self.now])
+        infos = [{"TimeLimit.truncated": bool(d) and end == "truncated"} for d, (*_, end) in zip(done, self.now, strict=True)]
+        self.buffer.add(obs, next_obs, action, reward, done, infos)
+        for i in range(n):
+            if done[i]:
+                episode, t, _, end = self.now[i]
+                self.finished.append((episode, t + 1, end))
+                self.now[i] = self._begin()
+
+
+def make_buffer(size=1500, n_envs=3, batch_length=10, **kwargs):
+    return SequenceReplayBuffer(size, IMAGE, ACTION, "cpu", n_envs, batch_length=batch_length, seed=0, **kwargs)
+
+
+def decode(batch):
+    """(episode, t), both (B, T)."""
+    pixels = batch.observation.numpy().reshape(*batch.observation.shape[:2], 4).astype(int)
+    return pixels[..., 0] + 256 * pixels[..., 1], pixels[..., 2] + 256 * pixels[..., 3]
+
+
+def held(streams):
+    """The finished episodes that must still be there: the newest that fit, too short ones apart."""
+    kept, rows = [], 0
+    for episode, length, end in reversed([e for e in streams.finished if e[1] >= streams.buffer.batch_length]):
+        if kept and rows + length > streams.buffer.buffer_size:
+            break
+        kept.append((episode, length, end))
+        rows += length
+    return kept
+
+
+def check_rows(batch, ends=None):
+    """Every row carries what led to it, and no sequence leaves its episode."""
+    episode, t = decode(batch)
+    assert (episode == episode[:, :1]).all() and (np.diff(t, axis=1) == 1).all()
+    led = t > 0
+    expected_action = np.where(led[..., None], np.stack([episode, t], -1), 0)
+    assert np.array_equal(batch.action.numpy(), expected_action)
+    assert np.allclose(batch.reward.numpy(), np.where(led, episode + t / 1000, 0), atol=1e-3)
+    assert batch.is_first[:, 0].all() and not batch.is_first[:, 1:].any()
+    if ends is not None:
+        last = {e: (rows - 1, end) for e, rows, end in ends}
+        terminal = [
+            [last[e] == (step, "terminal") for e, step in zip(*row, strict=True)] for row in zip(episode, t, strict=True)
+        ]
+        assert np.array_equal(batch.is_terminal.numpy(), terminal)
+
+
+def test_trap():
+    rng = np.random.default_rng(1)
+    streams = Streams(make_buffer(), lambda _: (int(rng.integers(1, 121)), rng.choice(["terminal", "truncated"])))
+    for step in range(3 * 1500):  # three rows a step: nine times round
+        streams.step()
+        if step % 500 == 400:
+            check_rows(streams.buffer.sample(20), held(streams))
+    expected = held(streams)
+    assert len(streams.finished) > 200 and {end for *_, end in expected} == {"terminal", "truncated"}
+    draws: Counter[tuple[int, int]] = Counter()
+    for _ in range(100):
+        batch = streams.buffer.sample(100)
+        check_rows(batch, expected)
+        episode, t = decode(batch)
+        draws.update(zip(episode[:, 0].tolist(), t[:, 0].tolist(), strict=True))
+    # An episode uniformly, then a start uniformly.
+    chances = {(e, s): 1 / len(expected) / (rows - 9) for e, rows, _ in expected for s in range(rows - 9)}
+    assert set(draws) <= set(chances)
+    statistic = sum((draws[key] - 10_000 * p) ** 2 / (10_000 * p) for key, p in chances.items())
+    freedom = len(chances) - 1
+    assert abs(statistic - freedom) < 5 * math.sqrt(2 * freedom)
+    by_episode = Counter(e for e, _ in draws.elements())
+    fair = 10_000 / len(expected)
+    statistic = sum((by_episode[e] - fair) ** 2 / fair for e, *_ in expected)
+    assert abs(statistic - len(expected)) < 5 * math.sqrt(2 * len(expected))
+
+
+@given(
+    lengths=st.lists(st.integers(1, 30), min_size=1, max_size=12),
+    n_envs=st.integers(1, 4),
+    batch_length=st.integers(2, 12),
+    buffer_size=st.integers(32, 100),  # longer than any episode: those that do not fit are cut, see below
+    steps=st.integers(1, 120),
+)
+def test_whatever_the_lengths(lengths, n_envs, batch_length, buffer_size, steps):
+    buffer = make_buffer(buffer_size, n_envs, batch_length)
+    streams = Streams(buffer, lambda e: (lengths[e % len(lengths)], "terminal" if e % 2 else "truncated"))
+    for _ in range(steps):
+        streams.step()
+    expected = held(streams)
+    assert buffer.can_sample() == bool(expected)
+    assert buffer.finished_rows == sum(rows for _, rows, _ in expected)
+    assert buffer.finished_rows <= buffer_size or len(expected) == 1  # the newest stays, however long
+    assert buffer.size() == buffer.finished_rows + sum(t + 1 for _, t, *_ in streams.now if t > 0)
+    assert buffer.finished_count == len(streams.finished)
+    assert buffer.longest == max((rows for _, rows, _ in streams.finished), default=0)
+    if not expected:
+        with pytest.raises(ValueError, match=f"batch_length={batch_length}"):
+            buffer.sample(1)
+        return
+    batch = buffer.sample(60)
+    check_rows(batch, expected)
+    assert set(decode(batch)[0].flatten().tolist()) <= {e for e, *_ in expected}
+
+
+def test_types_and_shapes_of_a_batch():
+    streams = Streams(make_buffer(), lambda _: (20, "truncated"))
+    for _ in range(20):
+        streams.step()
+    batch = streams.buffer.sample(7)
+    assert batch.observation.shape == (7, 10, 1, 2, 2) and str(batch.observation.dtype) == "torch.uint8"
+    assert batch.action.shape == (7, 10, 2) and str(batch.action.dtype) == "torch.float32"
+    for part, dtype in (("reward", "float32"), ("is_first", "bool"), ("is_terminal", "bool")):
+        assert getattr(batch, part).shape == (7, 10) and str(getattr(batch, part).dtype) == f"torch.{dtype}"
+
+
+def test_only_finished_episodes_are_drawn_and_closing_ends_them_as_truncated():
+    buffer = make_buffer(n_envs=2)
+    streams = Streams(buffer, lambda _: (1000, "terminal"))
+    for _ in range(30):
+        streams.step()
+    assert not buffer.can_sample() and buffer.size() == 2 * 31
+    buffer.close_streams()
+    assert buffer.can_sample() and buffer.size() == 2 * 31 and buffer.open == [None, None]
+    check_rows(buffer.sample(50), [(0, 31, "truncated"), (1, 31, "truncated")])
+    buffer.close_streams()  # nothing is open: nothing happens
+    assert buffer.finished_count == 2
+
+
+def test_endless_episodes_are_drawn_in_pieces():
+    buffer = make_buffer(size=60, n_envs=1, max_episode_rows=20)
+    streams = Streams(buffer, lambda _: (10**6, "terminal"))
+    for step in range(1, 200):
+        streams.step()
+        assert buffer.finished_rows <= 60 and buffer.size() <= 60 + 20
+        # A piece holds 19 steps after its first observation.
+        assert buffer.can_sample() == (step >= 19)
+    assert [len(episode) for episode in buffer.episodes] == [20] * 3
+    for episode in buffer.episodes:
+        numbers = episode.observation.reshape(20, 4).astype(int)
+        t = numbers[:, 2] + 256 * numbers[:, 3]
+        assert (np.diff(t) == 1).all() and not episode.is_terminal.any()
+        # The piece's first row begins it, as an episode's would.
+        assert not episode.action[0].any() and episode.reward[0] == 0
+        assert np.array_equal(episode.action[1:, 1], t[1:])
+
+
+def test_endless_episodes_respect_the_buffers_size():
+    buffer = make_buffer(size=60, n_envs=1)
+    streams = Streams(buffer, lambda _: (10**6, "terminal"))
+    for _ in range(200):
+        streams.step()
+    assert buffer.size() <= 2 * 60 and buffer.can_sample()
+
+
+def test_memory_is_taken_as_episodes_arrive_and_given_back():
+    buffer = SequenceReplayBuffer(10**9, spaces.Box(0, 255, (3, 64, 64), np.uint8), ACTION, "cpu", 1, batch_length=50)
+    zeros = np.zeros((1, 3, 64, 64), np.uint8)
+    for t in range(200):
+        buffer.add(zeros, zeros, np.zeros((1, 2)), np.zeros(1), np.array([t == 199]), [{}])
+    assert buffer.episodes[0].observation.nbytes == 201 * 3 * 64 * 64
+
+
+def test_equal_seeds_draw_equally(tmp_path):
+    batches = []
+    for _ in range(2):
+        streams = Streams(make_buffer(), lambda e: (15 + e % 7, "truncated"))
+        for _ in range(100):
+            streams.step()
+        batches.append(streams.buffer.sample(30))
+    assert np.array_equal(*[batch.observation.numpy() for batch in batches])
+    save_to_pkl(tmp_path / "replay.pkl", streams.buffer)
+    copy = load_from_pkl(tmp_path / "replay.pkl")
+    assert np.array_equal(copy.sample(30).observation, streams.buffer.sample(30).observation)
+
+
+def test_n_dimensional_actions_are_stored_flat():
+    space = spaces.Box(-1, 1, (2, 3), np.float32)
+    buffer = SequenceReplayBuffer(100, IMAGE, space, "cpu", 1, batch_length=2, seed=0)
+    action = np.arange(6, dtype=np.float32)
+    buffer.add(np.zeros((1, 1, 2, 2)), np.zeros((1, 1, 2, 2)), action[None], np.ones(1), np.ones(1, bool), [{}])
+    assert np.array_equal(buffer.sample(1).action[0].numpy(), [np.zeros(6), action])
+
+
+@pytest.mark.parametrize(("name", "kwargs"), [("buffer_size", {"size": 9}), ("max_episode_rows", {"max_episode_rows": 9})])
+def test_a_sequence_longer_than_what_is_kept_is_refused(name, kwargs):
+    with pytest.raises(ValueError, match=f"batch_length=10.*{name}=9"):
+        make_buffer(**kwargs)
+
+
+def test_reset_forgets_everything():
+    streams = Streams(make_buffer(), lambda _: (20, "truncated"))
+    for _ in range(25):
+        streams.step()
+    streams.buffer.reset()
+    assert streams.buffer.size() == 0 and not streams.buffer.can_sample() and streams.buffer.finished_count == 0
