@@ -35,8 +35,8 @@ class DemoConfig:
     out: Path = Path("demo_output")
     task: str = "walker-stand"
     pretrain_frames: int = 5000
-    finetune_frames: int = 5000
-    episodes: int = 5
+    finetune_frames: int = 10_000
+    episodes: int = 3
     seed: int = 0
     preset: str = "small"
     fast_render: bool = True

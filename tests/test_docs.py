@@ -1,0 +1,76 @@
+"""The code in README and docs runs, at a size that tests can afford."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from fake_envs import CounterEnv
+from gymnasium import spaces
+
+from sb3_dreamer_urlb import dreamer_v2
+from sb3_dreamer_urlb.presets import PRESETS
+
+ROOT = Path(__file__).parent.parent
+# What makes an example small: the paper's numbers of frames and steps.
+SMALL = {"2_000_000": "480", "2000000": "480", "1_050_000": "360", "50_000": "120", "n_eval_episodes=10": "n_eval_episodes=1"}
+
+
+def code_blocks(name: str) -> list[str]:
+    """The Python blocks of a page, in their order."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), re.DOTALL)
+
+
+@pytest.fixture
+def small_world(monkeypatch, tmp_path):
+    """A cheap walker, the smallest networks, an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PRESETS, "paper", PRESETS["tiny"])
+    asked = []
+
+    def make(name, **kwargs):
+        asked.append(name)
+        return CounterEnv(60, action_space=spaces.Box(-1, 1, (6,), np.float32), domain="walker", action_repeat=2)
+
+    monkeypatch.setattr(gymnasium, "make", make)
+    return asked
+
+
+def run(block: str, names: dict) -> dict:
+    """Execute a block at small size."""
+    for large, small in SMALL.items():
+        block = block.replace(large, small)
+    exec(compile(block, "example", "exec"), names)
+    return names
+
+
+def test_readme(small_world, tmp_path, capsys, monkeypatch):
+    first, second = code_blocks("README.md")
+    # At this size the only snapshot is the one the second example loads.
+    first = first.replace('SnapshotCallback("snapshots")', 'SnapshotCallback("snapshots", [480])')
+    names = run(first, {})
+    assert small_world == ["urlb/walker-stand-v0", "urlb/walker-run-v0"]
+    assert names["model"].phase == "finetuning" and names["model"]._planner_is_on()
+    assert (tmp_path / "walker-run.zip").exists() and re.search(r"\(.*30\.0.*\)", capsys.readouterr().out)
+    names = run(second, names)
+    assert names["model"].phase == "finetuning" and names["model"].phase_timesteps >= 120
+
+
+def test_an_intrinsic_reward_of_ones_own(small_world):
+    [block] = [block for block in code_blocks("docs/concepts.md") if "register_intrinsic_reward" in block]
+    model = run(block, {"env": gymnasium.make("walker")})["model"]
+    before = model.policy.agent.intrinsic.error.out.weight.clone()
+    model.learn(100)
+    assert model.phase_updates > 0 and not before.equal(model.policy.agent.intrinsic.error.out.weight)
+    assert "intrinsic_reward" in model._metrics.names
+    model.save("own")
+    assert dreamer_v2.DreamerV2.load("own").policy.agent.intrinsic is not None
+
+
+def test_every_local_link_leads_somewhere():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
