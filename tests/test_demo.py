@@ -20,14 +20,6 @@ from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_ep
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score
 
 
-@pytest.fixture(autouse=True)
-def same_threads():
-    """``run_demo`` sets torch's number of threads."""
-    threads = th.get_num_threads()
-    yield
-    th.set_num_threads(threads)
-
-
 @pytest.fixture
 def fake_walker(monkeypatch):
     """Put the counting environment in the walker's place; the ids that were asked for."""
