@@ -34,7 +34,7 @@ class DemoConfig:
 
     out: Path = Path("demo_output")
     task: str = "walker-stand"
-    pretrain_frames: int = 5000
+    pretrain_frames: int = 3000
     finetune_frames: int = 10_000
     episodes: int = 3
     seed: int = 0

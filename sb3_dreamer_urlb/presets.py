@@ -18,8 +18,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     # stops exploring; the slow critic must keep up; so few samples need more of the actor's trajectories among them.
     "small": {
         "learning_rate": 1e-3,
-        "actor_learning_rate": 2e-4,
-        "critic_learning_rate": 5e-4,
+        "actor_learning_rate": 1e-4,
+        "critic_learning_rate": 3e-4,
         "batch_size": 8,
         "batch_length": 32,
         "train_freq": 3,
@@ -27,8 +27,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "buffer_size": 100_000,
         "ent_coef": 1e-3,
         "target_update_interval": 25,
-        "planner_delay": 1500,
-        "planner_kwargs": {"n_samples": 24, "iterations": 12, "top_k": 8, "mixture": 1.0},
+        "planner_delay": 2500,
+        "planner_kwargs": {"n_samples": 64, "iterations": 6, "top_k": 8, "mixture": 0.5},
         "policy_kwargs": {
             "cnn_depth": 8,
             "deter_size": 128,
