@@ -2,7 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from common import make_model, parser, report, seconds
+
+from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.types import Posterior, SequenceBatch
+
+
+def world_model_pass(learner: Learner, batch: SequenceBatch) -> Callable[[], Posterior]:
+    """The world model's part of an update: infer, loss, step."""
+
+    def work() -> Posterior:
+        model = learner.agent.world_model
+        image = model.preprocess(batch.observation)
+        posterior = model.observe(image, batch.action, batch.is_first)
+        learner._update_world_model(posterior, image, batch)
+        return posterior
+
+    return work
 
 
 def main() -> None:
@@ -20,11 +38,12 @@ def main() -> None:
     for _ in range(options.repeat):
         for name, model in learners.items():
             learner, batch, device = model.learner, batches[name], model.device
-            posterior, _ = learner._update_world_model(batch)
+            model_pass = world_model_pass(learner, batch)
+            posterior = model_pass()
             work = {
                 name: lambda learner=learner, batch=batch: learner.update(batch),
-                f"{name}, world model": lambda learner=learner, batch=batch: learner._update_world_model(batch),
-                f"{name}, behaviour": lambda learner=learner, state=posterior.state: learner._update_behavior(state),
+                f"{name}, world model": lambda model_pass=model_pass: model_pass(),
+                f"{name}, behaviour": lambda learner=learner, state=posterior.state: learner._update_behavior(state.detach()),
             }
             for row, part in work.items():
                 rows.setdefault(row, []).extend(seconds(part, 1, device))

@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb demo``, or ``python -m sb3_dreamer_urlb demo``."""
+"""The command line: ``sb3-dreamer-urlb demo|methods``, or ``python -m sb3_dreamer_urlb demo|methods``."""
 
 from __future__ import annotations
 
@@ -25,17 +25,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     demo.add_argument("--finetune-frames", type=int)
     demo.add_argument("--episodes", type=int, help="evaluation episodes")
     demo.add_argument("--preset", help="of the model (default: small)")
+    tour = commands.add_parser("methods", help="pre-train and fine-tune once with every exploration method, and print a table")
+    tour.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
+    tour.add_argument("--methods", nargs="+", type=str, help="which (default: all)")
+    tour.add_argument("--task", help="default: walker-stand")
+    tour.add_argument("--seed", type=int)
+    tour.add_argument("--pretrain-frames", type=int)
+    tour.add_argument("--finetune-frames", type=int)
+    tour.add_argument("--episodes", type=int, help="evaluation episodes")
+    tour.add_argument("--preset", help="of the model (default: small)")
+    tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
-    options.pop("command")
+    command = options.pop("command")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Heavy imports only now, so that --help answers at once.
-    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
-
     try:
-        run_demo(DemoConfig(**options))
+        if command == "demo":
+            from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+
+            run_demo(DemoConfig(**options))
+        else:
+            from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
+
+            visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
+            return int(any(visit.faults() for visit in visits))
     except (ValueError, ImportError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.behavior.actor_critic import Actor, RewardNormalizer
+from sb3_dreamer_urlb.behavior.actor_critic import Actor, Critic, RewardNormalizer, SuccessorCritic
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
-from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
@@ -20,37 +20,79 @@ class Agent(nn.Module):
 
     :param world_model: the model
     :param net_arch: hidden layers of actor and critic
-    :param intrinsic: class of the intrinsic reward, None for the task's reward
+    :param intrinsic: what it explores with, not yet built; None for an agent without skills that learns a task
+    :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     """
 
-    def __init__(self, world_model: WorldModel, net_arch: Sequence[int], intrinsic: type[IntrinsicReward] | None):
+    def __init__(
+        self, world_model: WorldModel, net_arch: Sequence[int], intrinsic: IntrinsicReward | None, explores: bool = True
+    ):
         super().__init__()
         sizes = world_model.sizes
         self.world_model = world_model
-        self.actor = Actor(sizes.feature, sizes.action, net_arch)
-        self.critic = MLP(sizes.feature, net_arch)
+        self.intrinsic = copy.deepcopy(intrinsic)
+        self.explores = explores and intrinsic is not None
+        if self.intrinsic is not None:
+            self.intrinsic.build(sizes)
+        skill_size = 0 if self.skills is None else self.skills.dim
+        critic_class = SuccessorCritic if intrinsic is not None and intrinsic.successor_features else Critic
+        self.actor = Actor(sizes.feature, sizes.action, net_arch, skill_size)
+        self.critic = critic_class(sizes.feature, net_arch, skill_size)
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.intrinsic = None if intrinsic is None else intrinsic(sizes)
-        self.reward_normalizer = RewardNormalizer(1.0 if intrinsic is None else intrinsic.momentum)
+        self.reward_normalizer = RewardNormalizer(intrinsic.momentum if self.explores and intrinsic is not None else 1.0)
 
-    # -- what a planner sees -------------------------------------------------------------------------------------------
+    @property
+    def skills(self) -> Skills | None:
+        """What actor and critic are conditioned on, None for a method without skills."""
+        return None if self.intrinsic is None else self.intrinsic.skills
+
+    def acts_randomly(self) -> bool:
+        """Whether exploration is nothing but uniformly random actions."""
+        return self.explores and self.intrinsic is not None and not self.intrinsic.trains_actor
+
+    def trains_behavior(self) -> bool:
+        """Whether actor and critic have something to learn now.
+
+        Not while random actions explore, and not in fine-tuning before its skill is chosen (spec/algorithms §6).
+        """
+        if self.explores:
+            return not self.acts_randomly()
+        return self.skills is None or self.skills.is_fixed
+
+
+class PlannedAgent:
+    """All that a planner sees of an agent: a few verbs, with one skill for each environment.
+
+    :param agent: the networks
+    :param skill: that each of the n environments follows, float (n, W); W is 0 without skills
+    """
+
+    def __init__(self, agent: Agent, skill: th.Tensor):
+        self.agent = agent
+        self.skill = skill if agent.skills is not None else None
 
     def step(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> LatentState:
         """Sample the next state from the prior."""
-        return self.world_model.rssm.prior_step(state, action, generator)
+        return self.agent.world_model.rssm.prior_step(state, action, generator)
 
     def rewards(self, feature: th.Tensor) -> th.Tensor:
-        """The reward head's mean, (…, F) → (…)."""
-        return self.world_model.reward(feature)
+        """The reward head's mean, (…, n·M, F) → (…, n·M)."""
+        return self.agent.world_model.reward(feature)
 
     def values(self, feature: th.Tensor) -> th.Tensor:
-        """The slow critic's mean, (…, F) → (…)."""
-        return self.slow_critic(feature)
+        """The slow critic's mean, (…, n·M, F) → (…, n·M)."""
+        return self.agent.slow_critic(feature, self._skill_of(feature))
 
     def discounts(self, feature: th.Tensor) -> th.Tensor:
-        """γ, or γ · p(the episode goes on), (…, F) → (…)."""
-        return self.world_model.discount(feature)
+        """γ, or γ · p(the episode goes on), (…, n·M, F) → (…, n·M)."""
+        return self.agent.world_model.discount(feature)
 
     def act(self, feature: th.Tensor, generator: th.Generator | None) -> th.Tensor:
-        """Sample the actor, (…, F) → (…, A) in (-1, 1)."""
-        return self.actor(feature).sample(generator)
+        """Sample the actor, (…, n·M, F) → (…, n·M, A) in (-1, 1)."""
+        return self.agent.actor(feature, self._skill_of(feature)).sample(generator)
+
+    def _skill_of(self, feature: th.Tensor) -> th.Tensor | None:
+        """The skill of each row: M rows in a row belong to one environment, float (n·M, W)."""
+        if self.skill is None:
+            return None
+        return self.skill.repeat_interleave(feature.shape[-2] // self.skill.shape[0], 0)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
@@ -28,6 +28,7 @@ INTEGERS = {
     "batch_length": 2,
     "imagination_horizon": 2,
     "planner_delay": 0,
+    "skill_selection_starts": 0,
     "target_update_interval": 1,
 }
 # open or closed ranges of each number: (low, low allowed, high, high allowed)
@@ -49,6 +50,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "gamma",
     "discount_head",
     "intrinsic",
+    "explores",
     "planner",
     "planning",
 }
@@ -93,10 +95,9 @@ def check(model: DreamerV2) -> None:
 
 def _check_names(model: DreamerV2) -> None:
     method = model.intrinsic_reward
-    if isinstance(method, str):
-        get_intrinsic_reward(method)
-    elif method is not None and not (isinstance(method, type) and issubclass(method, IntrinsicReward)):
-        raise ValueError(f"intrinsic_reward must be a name, a subclass of IntrinsicReward or None, got {method!r}.")
+    intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
+    if intrinsic is not None:
+        intrinsic.check(particles=(model.imagination_horizon + 1) * model.batch_size * model.batch_length)
     if method is None and PHASES[model.phase].explores:
         raise ValueError(
             f"A model in the phase {model.phase!r} needs an intrinsic_reward, got None: to move on to the task, "
@@ -155,7 +156,7 @@ def check_replay_buffer(model: DreamerV2, buffer: Any) -> None:
         raise ValueError(f"The file holds no SequenceReplayBuffer but {type(buffer).__name__}.")
     if buffer.phase != model.phase:
         raise ValueError(f"The replay buffer was filled in the phase {buffer.phase!r}, the model is in {model.phase!r}.")
-    for name in ("n_envs", "batch_length"):
+    for name in ("n_envs", "batch_length", "skill_size"):
         if getattr(buffer, name) != getattr(model, name):
             raise ValueError(f"The replay buffer has {name}={getattr(buffer, name)}, the model {getattr(model, name)}.")
     for name in ("observation_space", "action_space"):

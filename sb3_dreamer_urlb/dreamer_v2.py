@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import arguments, phases
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
@@ -55,8 +55,12 @@ class DreamerV2(OffPolicyAlgorithm):
     :param gae_lambda: λ of the returns
     :param train_freq: update after this many steps (of the vectorised environment)
     :param gradient_steps: updates each time; -1 for as many as steps were taken
-    :param intrinsic_reward: name of a method (``"lbs"``), a subclass of
+    :param intrinsic_reward: ``"icm"``, ``"plan2explore"``, ``"rnd"``, ``"lbs"``, ``"apt"``, ``"diayn"``, ``"aps"``,
+        ``"random"``, another registered name, a subclass or an instance of
         :class:`~sb3_dreamer_urlb.IntrinsicReward`, or None to learn the task
+    :param intrinsic_kwargs: hyperparameters of the intrinsic reward, for a name or a class
+    :param skill_selection_starts: agent steps of fine-tuning before a skill is chosen (DIAYN, APS); until then only the
+        world model learns
     :param planner: ``"dyna_mpc"``, ``"mppi"`` or None; acts in fine-tuning, also in ``predict``
     :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`
     :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
@@ -105,7 +109,9 @@ class DreamerV2(OffPolicyAlgorithm):
         gae_lambda: float = 0.95,
         train_freq: int | tuple[int, str] = 5,
         gradient_steps: int = 1,
-        intrinsic_reward: str | type[IntrinsicReward] | None = None,
+        intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None = None,
+        intrinsic_kwargs: dict[str, Any] | None = None,
+        skill_selection_starts: int = 2000,
         planner: str | None = None,
         planner_kwargs: dict[str, Any] | None = None,
         planner_delay: int = 500,
@@ -157,6 +163,8 @@ class DreamerV2(OffPolicyAlgorithm):
         self.imagination_horizon = imagination_horizon
         self.gae_lambda = gae_lambda
         self.intrinsic_reward = intrinsic_reward
+        self.intrinsic_kwargs = intrinsic_kwargs
+        self.skill_selection_starts = skill_selection_starts
         self.planner = planner
         self.planner_kwargs = planner_kwargs
         self.planner_delay = planner_delay
@@ -207,10 +215,13 @@ class DreamerV2(OffPolicyAlgorithm):
 
     def _build(self) -> None:
         """Fresh networks, optimisers and replay for the current phase."""
+        explores = phases.PHASES[self.phase].explores
+        intrinsic = make_intrinsic_reward(self.intrinsic_reward, self.intrinsic_kwargs)
+        if intrinsic is not None and intrinsic.skills is None and not explores:
+            intrinsic = None
+        self.skill_size = 0 if intrinsic is None or intrinsic.skills is None else intrinsic.skills.dim
         if getattr(self, "replay_buffer", None) is None:
             self.replay_buffer = self._new_replay_buffer()
-        method = self.intrinsic_reward if phases.PHASES[self.phase].explores else None
-        intrinsic = get_intrinsic_reward(method) if isinstance(method, str) else method
         self.policy = self.policy_class(
             self.observation_space,
             self.action_space,
@@ -218,6 +229,7 @@ class DreamerV2(OffPolicyAlgorithm):
             gamma=self.gamma,
             discount_head=bool(self.discount_head),
             intrinsic=intrinsic,
+            explores=explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda),
             **self.policy_kwargs,
         ).to(self.device)
@@ -226,7 +238,7 @@ class DreamerV2(OffPolicyAlgorithm):
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
-    def _learner_config(self, intrinsic: type[IntrinsicReward] | None) -> LearnerConfig:
+    def _learner_config(self, intrinsic: IntrinsicReward | None) -> LearnerConfig:
         return LearnerConfig(
             learning_rate=self.lr_schedule(1),
             actor_learning_rate=self._actor_lr_schedule(1),
@@ -251,7 +263,13 @@ class DreamerV2(OffPolicyAlgorithm):
             self.action_space,
             device=self.device,
             n_envs=self.n_envs,
-            **{"batch_length": self.batch_length, "seed": self.seed, "phase": self.phase, **self.replay_buffer_kwargs},
+            **{
+                "batch_length": self.batch_length,
+                "seed": self.seed,
+                "phase": self.phase,
+                "skill_size": self.skill_size,
+                **self.replay_buffer_kwargs,
+            },
         )
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
@@ -284,6 +302,29 @@ class DreamerV2(OffPolicyAlgorithm):
         self._build()
         phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
         self._last_obs = None
+
+    def fix_skill(self, skill: int | np.ndarray | None) -> None:
+        """Follow one skill from now on, in training as in ``predict`` (DIAYN, APS).
+
+        :param skill: float (W,), or the number of a one-hot skill; None draws random ones again, and lets fine-tuning choose
+        :raises ValueError: if the method has no skills, or this is none of them
+        """
+        skills = self.policy.agent.skills
+        if skills is None:
+            raise ValueError(f"intrinsic_reward={self.intrinsic_reward!r} has no skills.")
+        skills.fix(skills.numbered(int(skill)) if isinstance(skill, (int, np.integer)) else skill)
+
+    def _choose_skill(self) -> None:
+        """Choose the skill that serves the task best (spec/algorithms §6)."""
+        agent = self.policy.agent
+        if not isinstance(agent.intrinsic, SkillReward) or agent.explores:
+            return
+        sequences = -(-max(phases.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
+        batch = self.replay_buffer.sample(sequences, env=self._vec_normalize_env)
+        model = agent.world_model
+        with th.no_grad():
+            posterior = model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)
+            agent.intrinsic.skills.fix(agent.intrinsic.choose_skill(agent.actor, posterior, batch))
 
     def restart_episodes(self) -> None:
         """Reset all environments in the middle of ``learn``, because they changed."""
@@ -327,7 +368,7 @@ class DreamerV2(OffPolicyAlgorithm):
 
     def _planner_is_on(self) -> bool:
         due = self.phase_timesteps >= self.learning_starts + self.planner_delay
-        return self.planner is not None and phases.PHASES[self.phase].plans and due
+        return self.planner is not None and phases.PHASES[self.phase].plans and due and self.policy.agent.trains_behavior()
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -376,8 +417,9 @@ class DreamerV2(OffPolicyAlgorithm):
         next_obs = np.array(new_obs)
         for i in np.flatnonzero(dones):
             next_obs[i] = infos[i].get("terminal_observation", next_obs[i])
-        assert isinstance(self._last_obs, np.ndarray)
-        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos)
+        assert isinstance(self._last_obs, np.ndarray) and self._acting_state is not None
+        skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
+        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos, **skill)
         self._last_obs = new_obs
         self._last_episode_starts = dones.astype(bool)
 
@@ -447,6 +489,8 @@ class DreamerV2(OffPolicyAlgorithm):
         if not self.replay_buffer.can_sample():
             arguments.check_episode_length(self.replay_buffer)
             return
+        if not self.policy.agent.trains_behavior() and self.phase_timesteps > self.skill_selection_starts:
+            self._choose_skill()
         self.policy.set_training_mode(True)
         self._set_learning_rates()
         for _ in range(gradient_steps):

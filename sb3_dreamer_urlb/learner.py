@@ -9,12 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
-from sb3_dreamer_urlb.intrinsic.base import RewardSource, TaskReward
+from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.optim import ClippedAdam
 from sb3_dreamer_urlb.types import LatentState, Metrics, Posterior, SequenceBatch
 
@@ -39,7 +40,10 @@ class LearnerConfig:
 
 
 class Learner:
-    """Trains an agent; the order is the paper's: world model, intrinsic reward, actor, critic.
+    """Trains an agent: intrinsic reward, world model, actor, critic.
+
+    The intrinsic reward comes first because some methods label the rewards that the reward head learns. It reads what the
+    world model inferred before its step, so for the others the order makes no difference (spec/algorithms §2).
 
     :param agent: the networks
     :param config: the numbers
@@ -53,15 +57,16 @@ class Learner:
         self.actor_optimizer = self._optimizer(agent.actor, config.actor_learning_rate)
         self.critic_optimizer = self._optimizer(agent.critic, config.critic_learning_rate)
         self.intrinsic_optimizer: ClippedAdam | None = None
-        self.reward_source: RewardSource = TaskReward(agent.world_model.reward)
-        if agent.intrinsic is not None:
+        self.reward_source = RewardSource()
+        if agent.intrinsic is not None and agent.explores:
             self.reward_source = agent.intrinsic
-            if any(True for _ in agent.intrinsic.parameters()):
+            if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
 
     def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
         config = self.config
-        return ClippedAdam(module.parameters(), learning_rate, config.adam_eps, config.max_grad_norm, config.weight_decay)
+        trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+        return ClippedAdam(trained, learning_rate, config.adam_eps, config.max_grad_norm, config.weight_decay)
 
     def optimizers(self) -> dict[str, ClippedAdam]:
         """All optimisers by name; the names are those of snapshots."""
@@ -79,44 +84,57 @@ class Learner:
         :param batch: (B, T, …) on the agent's device
         :return: metrics, detached scalars on the device
         """
-        posterior, metrics = self._update_world_model(batch)
-        metrics.update(self._update_intrinsic(posterior, batch))
-        metrics.update(self._update_behavior(posterior.state))
+        model = self.agent.world_model
+        image = model.preprocess(batch.observation)
+        posterior = model.observe(image, batch.action, batch.is_first)
+        metrics = self._update_intrinsic(_detached(posterior), batch)
+        metrics.update(self._update_world_model(posterior, image, batch))
+        if self.agent.trains_behavior():
+            metrics.update(self._update_behavior(posterior.state.detach()))
+            if self.agent.explores:
+                metrics["intrinsic_reward"] = metrics["imagined_reward"]
         self.updates += 1
         return metrics
 
-    def _update_world_model(self, batch: SequenceBatch) -> tuple[Posterior, Metrics]:
-        config = self.config
-        loss, posterior, metrics = self.agent.world_model.loss(
-            batch, config.free_nats, config.kl_balance, config.reward_trains_model
-        )
-        metrics["model_grad_norm"] = self.model_optimizer.step(loss)
-        return _detached(posterior), metrics
-
     def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
-        if self.agent.intrinsic is None or self.intrinsic_optimizer is None:
+        learnt = self.reward_source.loss(posterior, batch)
+        if learnt is None or self.intrinsic_optimizer is None:
             return {}
-        loss, metrics = self.agent.intrinsic.loss(posterior, batch)
-        metrics = {f"intrinsic_{name}": value for name, value in metrics.items()}
+        loss, metrics = learnt
+        metrics = {f"intrinsic_{name}": value.detach() for name, value in metrics.items()}
         metrics["intrinsic_grad_norm"] = self.intrinsic_optimizer.step(loss)
         metrics["intrinsic_loss"] = loss.detach()
         return metrics
 
+    def _update_world_model(self, posterior: Posterior, image: th.Tensor, batch: SequenceBatch) -> Metrics:
+        config = self.config
+        reward = self.reward_source.replay_reward(_detached(posterior), batch)
+        loss, metrics = self.agent.world_model.loss(
+            posterior, image, reward, batch.is_terminal, config.free_nats, config.kl_balance, config.reward_trains_model
+        )
+        if reward is not batch.reward:
+            metrics["intrinsic_replay_reward"] = reward.mean()
+            metrics["intrinsic_replay_reward_std"] = reward.std()
+        metrics["model_grad_norm"] = self.model_optimizer.step(loss)
+        return metrics
+
     def _update_behavior(self, start: LatentState) -> Metrics:
         agent, config = self.agent, self.config
+        start = start.flatten()
+        skill = None if agent.skills is None else agent.skills.sample(start.deter.shape[0])
         with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic):
-            imagination = agent.world_model.imagine(agent.actor, start.flatten(), config.imagination_horizon)
-            raw_reward = self.reward_source.reward(imagination)
+            imagination = agent.world_model.imagine(agent.actor, start, config.imagination_horizon, skill)
+            raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
             reward = agent.reward_normalizer(raw_reward)
             discount = agent.world_model.discount(imagination.feature)
-            value = agent.slow_critic(imagination.feature)
+            value = agent.slow_critic(imagination.feature, skill)
             weight = actor_critic.discount_weights(discount.detach())
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
             loss = actor_critic.actor_loss(target, weight)
             actor_grad_norm = self.actor_optimizer.step(loss)
-        value_now = agent.critic(imagination.feature[:-1].detach())
-        critic_loss = actor_critic.critic_loss(value_now, target.detach(), weight)
+        value_now = agent.critic(imagination.feature[:-1].detach(), skill)
+        critic_loss = agent.critic.loss(value_now, target.detach(), weight)
         critic_grad_norm = self.critic_optimizer.step(critic_loss)
         if self.updates % config.target_update_interval == 0:
             agent.slow_critic.load_state_dict(agent.critic.state_dict())

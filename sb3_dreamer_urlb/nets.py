@@ -35,3 +35,27 @@ class MLP(nn.Module):
         """(…, inputs) → (…, outputs), or (…) for a scalar head."""
         y = self.out(self.hidden(x))
         return y.squeeze(-1) if self.scalar else y
+
+
+class ReLUNet(nn.Module):
+    """Linear layers ``dense`` with ReLU between them, none after the last: the networks of the intrinsic rewards.
+
+    :param widths: input, hidden and output sizes
+    :param orthogonal: orthogonal weights and zero biases, instead of PyTorch's default
+    """
+
+    def __init__(self, widths: Sequence[int], orthogonal: bool = False):
+        super().__init__()
+        self.dense = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
+        if orthogonal:
+            for layer in self.dense:
+                assert isinstance(layer, nn.Linear)
+                nn.init.orthogonal_(layer.weight)
+                nn.init.zeros_(layer.bias)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """(…, widths[0]) → (…, widths[-1])."""
+        *hidden, last = self.dense
+        for layer in hidden:
+            x = F.relu(layer(x))
+        return last(x)

@@ -43,8 +43,8 @@ PHASES: dict[str, Phase] = {
 }
 
 KEPT, ACTOR_CHOICE, CRITIC_CHOICE, FRESH = "kept", "kept if keep_actor", "kept if keep_critic", "fresh"
-#: What a fine-tuning takes over from the pre-trained agent (spec/algorithms §4). Optimisers, replay and the intrinsic
-#: reward always stay behind.
+#: What a fine-tuning takes over from the pre-trained agent (spec/algorithms §4). Optimisers and replay always stay behind,
+#: and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
 TRANSFER: dict[str, str] = {
     "world_model.encoder": KEPT,
     "world_model.rssm": KEPT,
@@ -55,8 +55,12 @@ TRANSFER: dict[str, str] = {
     "critic": CRITIC_CHOICE,
     "slow_critic": CRITIC_CHOICE,
     "reward_normalizer": FRESH,
+    # The skills of DIAYN and APS, and what APS chooses one by (spec/algorithms §6).
+    "intrinsic": KEPT,
 }
 
+#: replayed states by which DIAYN and APS choose the skill for a task (spec/algorithms §6)
+SKILL_STATES = 4096
 #: Domains whose tasks give reward only in small regions: the pre-trained actor would drive away from them (paper §3).
 SPARSE_DOMAINS = ("jaco",)
 
@@ -183,7 +187,7 @@ def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None) -> float:
     """The actor's entropy bonus: the user's if given, otherwise the phase's, otherwise the intrinsic reward's.
 
     :param phase: a key of ``PHASES``
-    :param intrinsic: class of the intrinsic reward, None without
+    :param intrinsic: the intrinsic reward, None without
     :param chosen: the user's
     """
     if chosen is not None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import DynaMPC
@@ -25,22 +25,27 @@ IMAGE_SIZES = (16, 512)
 DETERMINISTIC_SEED = 0
 
 
-@dataclass
+@dataclasses.dataclass
 class ActingState:
     """What an acting agent remembers from one step to the next, for n environments.
 
     :param latent: posterior state, (n, …)
     :param action: the last action as executed, float (n, A) in [-1, 1]
     :param plan: the planner's mean, float (n, H, A); H is 0 without a planner
+    :param skill: that is being followed, float (n, W); W is 0 without skills
+    :param steps: observations since the episode began, int64 (n,)
     """
 
     latent: LatentState
     action: th.Tensor
     plan: th.Tensor
+    skill: th.Tensor
+    steps: th.Tensor
 
     def to_numpy(self) -> tuple[np.ndarray, ...]:
         """The form that SB3 hands through ``predict(state=…)``: arrays with leading n."""
-        return tuple(x.cpu().numpy() for x in (self.latent.stoch, self.latent.deter, self.action, self.plan))
+        parts = (self.latent.stoch, self.latent.deter, self.action, self.plan, self.skill, self.steps)
+        return tuple(part.cpu().numpy() for part in parts)
 
 
 class DreamerPolicy(BasePolicy):
@@ -57,7 +62,8 @@ class DreamerPolicy(BasePolicy):
     :param net_arch: hidden layers of every head, actor and critic, [400] * 4 if None
     :param gamma: discount factor
     :param discount_head: learn which states terminate
-    :param intrinsic: class of the intrinsic reward, None for the task's
+    :param intrinsic: what the agent explores with, not yet built; None for an agent that learns a task
+    :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
     :param normalize_images: part of SB3's interface; uint8 images are always scaled to [-0.5, 0.5]
@@ -77,7 +83,8 @@ class DreamerPolicy(BasePolicy):
         net_arch: Sequence[int] | None = None,
         gamma: float = 0.99,
         discount_head: bool = False,
-        intrinsic: type[IntrinsicReward] | None = None,
+        intrinsic: IntrinsicReward | None = None,
+        explores: bool = True,
         planner: DynaMPC | None = None,
         planning: bool = True,
         normalize_images: bool = True,
@@ -104,7 +111,8 @@ class DreamerPolicy(BasePolicy):
             discount_head=discount_head,
             **sizes,
         )
-        self.agent = Agent(world_model, net_arch, intrinsic)
+        self.agent = Agent(world_model, net_arch, intrinsic, explores)
+        self.intrinsic = intrinsic
         self.planner = planner
         self.planning = planning
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
@@ -114,7 +122,7 @@ class DreamerPolicy(BasePolicy):
         parameters.update(
             self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner, planning=self.planning
         )
-        parameters["intrinsic"] = None if self.agent.intrinsic is None else type(self.agent.intrinsic)
+        parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
 
     # -- acting --------------------------------------------------------------------------------------------------------
@@ -123,7 +131,9 @@ class DreamerPolicy(BasePolicy):
         """The memory of n agents that have seen nothing yet."""
         latent = self.agent.world_model.rssm.initial(n)
         action = latent.deter.new_zeros(n, self.agent.actor.action_size)
-        return ActingState(latent, action, self._empty_plan(n))
+        skill = latent.deter.new_zeros(n, 0 if self.agent.skills is None else self.agent.skills.dim)
+        steps = th.zeros(n, dtype=th.int64, device=self.device)
+        return ActingState(latent, action, self._empty_plan(n), skill, steps)
 
     def _empty_plan(self, n: int) -> th.Tensor:
         horizon = 0 if self.planner is None else self.planner.config.horizon
@@ -143,23 +153,42 @@ class DreamerPolicy(BasePolicy):
         embed = model.encoder(model.preprocess(observation))
         latent = model.rssm.posterior_step(state.latent, state.action, embed, is_first, generator)
         plan = state.plan if state.plan.shape[1:] == self._empty_plan(0).shape[1:] else self._empty_plan(len(embed))
-        return ActingState(latent, state.action, plan * (~is_first).to(plan.dtype).view(-1, 1, 1))
+        plan = plan * (~is_first).to(plan.dtype).view(-1, 1, 1)
+        steps = state.steps * ~is_first
+        return ActingState(latent, state.action, plan, self._skill_to_follow(state.skill, steps, generator), steps + 1)
+
+    def _skill_to_follow(self, skill: th.Tensor, steps: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """The fixed skill; without one, a new random one every ``skills.interval`` steps (spec/algorithms §6)."""
+        skills = self.agent.skills
+        if skills is None:
+            return skill
+        fresh = skills.sample(skill.shape[0], self._moved_on(generator, steps))
+        renew = steps % skills.interval == 0 if not skills.is_fixed else th.ones_like(steps, dtype=th.bool)
+        return th.where(renew.unsqueeze(-1), fresh, skill)
+
+    def _moved_on(self, generator: th.Generator | None, steps: th.Tensor) -> th.Generator | None:
+        """For draws that must differ from step to step even where equal inputs give equal actions."""
+        return generator and th.Generator(self.device).manual_seed(DETERMINISTIC_SEED + int(steps.sum()))
 
     def choose(self, state: ActingState, deterministic: bool, generator: th.Generator | None = None) -> ActingState:
-        """Choose the next action, with the planner if it is on, with the actor otherwise.
+        """Choose the next action, with the planner if it is on, with the actor otherwise; at random if it never learns.
 
         :param state: the memory after :meth:`observe`
         :param deterministic: the actor's mean, or a plan without exploration noise
         :param generator: source of randomness
         :return: the memory with the chosen action
         """
-        plan = state.plan
-        if self.planner is not None and self.planning:
-            action, plan = self.planner.plan(self.agent, state.latent, plan, generator, explore=not deterministic)
+        plan, skill = state.plan, state.skill
+        if self.agent.acts_randomly():
+            generator = self._moved_on(generator, state.steps)
+            action = 2 * th.rand(state.action.shape, generator=generator, device=self.device) - 1
+        elif self.planner is not None and self.planning:
+            planned = PlannedAgent(self.agent, skill)
+            action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
         else:
-            policy = self.agent.actor(state.latent.feature)
+            policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mean if deterministic else policy.sample(generator)
-        return ActingState(state.latent, action, plan)
+        return dataclasses.replace(state, action=action, plan=plan)
 
     # -- SB3's interface -----------------------------------------------------------------------------------------------
 
@@ -206,12 +235,12 @@ class DreamerPolicy(BasePolicy):
         return np.clip(unscaled, space.low, space.high).astype(space.dtype)
 
     def _memory(self, state: tuple[np.ndarray, ...], n: int) -> ActingState:
-        if not isinstance(state, tuple) or len(state) != 4:
-            raise ValueError(f"state must be what the last predict() returned, a tuple of 4 arrays, got {type(state)}.")
+        if not isinstance(state, tuple) or len(state) != 6:
+            raise ValueError(f"state must be what the last predict() returned, a tuple of 6 arrays, got {type(state)}.")
         if any(len(part) != n for part in state):
             raise ValueError(f"state is for {[len(part) for part in state]} environments, the observation for {n}.")
-        stoch, deter, action, plan = (th.as_tensor(part, device=self.device) for part in state)
-        return ActingState(LatentState(stoch, deter), action, plan)
+        stoch, deter, action, plan, skill, steps = (th.as_tensor(part, device=self.device) for part in state)
+        return ActingState(LatentState(stoch, deter), action, plan, skill, steps)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)

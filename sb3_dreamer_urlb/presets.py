@@ -28,6 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "ent_coef": 1e-3,
         "target_update_interval": 25,
         "planner_delay": 2500,
+        "skill_selection_starts": 500,
         "planner_kwargs": {"n_samples": 64, "iterations": 6, "top_k": 8, "mixture": 0.5},
         "policy_kwargs": {
             "cnn_depth": 8,
@@ -46,6 +47,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train_freq": 4,
         "learning_starts": 10,
         "planner_delay": 4,
+        "skill_selection_starts": 15,
         "buffer_size": 1000,
         "planner_kwargs": {"n_samples": 8, "iterations": 2, "top_k": 4, "mixture": 0.25, "horizon": 3},
         "policy_kwargs": {

@@ -1,7 +1,8 @@
 """The few things that travel between the parts of the agent.
 
 Symbols used everywhere: B sequences a batch, T steps a sequence, N = B·T start states, H imagination horizon,
-A action size, D deterministic size, S·K stochastic size (S categoricals of K classes), F = S·K + D feature size.
+A action size, D deterministic size, S·K stochastic size (S categoricals of K classes), F = S·K + D feature size,
+W skill size.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ class SequenceBatch:
     :param reward: float32 (B, T); zero in an episode's first row
     :param is_first: bool (B, T), true for an episode's first row; the first row of every chunk counts as one
     :param is_terminal: bool (B, T), true where the environment terminated (not where it was truncated)
+    :param skill: float32 (B, T, W), the skill that each row's action followed; None without skills
     """
 
     observation: th.Tensor
@@ -29,6 +31,7 @@ class SequenceBatch:
     reward: th.Tensor
     is_first: th.Tensor
     is_terminal: th.Tensor
+    skill: th.Tensor | None = None
 
 
 @dataclass
@@ -94,11 +97,13 @@ class Imagination:
     :param feature: float (H + 1, N, F) of z_0 … z_H; z_0 is where the dream starts
     :param action: float (H + 1, N, A); action t led to state t, so the first is zero
     :param entropy: of the actor at z_0 … z_{H-1} in nats, float (H, N)
+    :param skill: that the actor followed, float (N, W), None without skills
     """
 
     feature: th.Tensor
     action: th.Tensor
     entropy: th.Tensor
+    skill: th.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +112,8 @@ class ModelSizes:
 
     :param action: A, :param embed: E, :param feature: F, :param deter: D
     :param net_arch: widths of the hidden layers of every head, actor and critic
+    :param image_shape: (channels, height, width)
+    :param cnn_depth: channels of the encoder's first convolution
     """
 
     action: int
@@ -114,27 +121,28 @@ class ModelSizes:
     feature: int
     deter: int
     net_arch: tuple[int, ...]
+    image_shape: tuple[int, int, int]
+    cnn_depth: int
 
 
 class MetricMeans:
     """Running means of metrics, on the device until somebody asks."""
 
     def __init__(self) -> None:
-        self.names: list[str] = []
-        self.total: th.Tensor | None = None
-        self.count = 0
+        self.sums: dict[str, th.Tensor] = {}
+        self.counts: dict[str, int] = {}
 
     def add(self, metrics: Metrics) -> None:
-        """Take one update's metrics in; all updates since the last :meth:`take` have the same names."""
-        values = th.stack(list(metrics.values()))
-        self.names = list(metrics)
-        self.total = values if self.total is None else self.total + values
-        self.count += 1
+        """Take one update's metrics in."""
+        for name, value in metrics.items():
+            self.sums[name] = self.sums[name] + value if name in self.sums else value
+            self.counts[name] = self.counts.get(name, 0) + 1
 
     def take(self) -> dict[str, float]:
-        """The means since the last call, empty if there was no update. Waits for the device."""
-        if self.total is None:
+        """The means since the last call, empty if there was no update. Waits for the device, once."""
+        if not self.sums:
             return {}
-        means = dict(zip(self.names, (self.total / self.count).tolist(), strict=True))
-        self.__init__()  # type: ignore[misc]
+        sums = th.stack(list(self.sums.values())).tolist()
+        means = {name: total / self.counts[name] for name, total in zip(self.sums, sums, strict=True)}
+        self.sums, self.counts = {}, {}
         return means

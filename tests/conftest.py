@@ -12,9 +12,9 @@ from hypothesis import settings
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.agent import Agent
-from sb3_dreamer_urlb.intrinsic import get_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
-from sb3_dreamer_urlb.types import SequenceBatch
+from sb3_dreamer_urlb.types import Posterior, SequenceBatch
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 IMAGE, ACTIONS = (3, 16, 16), 2
@@ -86,8 +86,8 @@ def learner(world_model: Callable[..., WorldModel]) -> Callable[..., Learner]:
     """Make a learner with a tiny agent of its own."""
 
     def make(intrinsic: str | None = None, discount_head: bool = False, **kwargs: Any) -> Learner:
-        method = None if intrinsic is None else get_intrinsic_reward(intrinsic)
-        agent = Agent(world_model(discount_head=discount_head), [8], method)
+        kwargs_of_method = {"k": 3} if intrinsic in ("apt", "aps") else {}
+        agent = Agent(world_model(discount_head=discount_head), [8], make_intrinsic_reward(intrinsic, kwargs_of_method))
         return Learner(agent, LearnerConfig(**{**LEARNER, **kwargs}))
 
     return make
@@ -103,6 +103,11 @@ def batch(seeded: None) -> SequenceBatch:
     is_terminal[0, -1] = True
     observation = th.randint(0, 256, (*lead, *IMAGE), dtype=th.uint8)
     return SequenceBatch(observation, th.rand(*lead, ACTIONS) * 2 - 1, th.rand(lead), is_first, is_terminal)
+
+
+def infer(model: WorldModel, batch: SequenceBatch) -> Posterior:
+    """What a world model infers about a batch, with its graph."""
+    return model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)
 
 
 def weights(module: th.nn.Module) -> dict[str, bytes]:

@@ -20,16 +20,27 @@ import numpy as np
 import torch as th
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.behavior import actor_critic
-from sb3_dreamer_urlb.intrinsic import get_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 RELATIVE, ABSOLUTE = 1e-4, 2e-5
-METHODS = {"dreamer": None, "lbs_dreamer": "lbs"}
+# The authors' name of each method, ours, and where its hyperparameters stand in the file's configuration.
+METHODS: dict[str, tuple[str | None, dict[str, str]]] = {
+    "dreamer": (None, {}),
+    "lbs_dreamer": ("lbs", {}),
+    "plan2explore": ("plan2explore", {}),
+    "icm_dreamer": ("icm", {}),
+    "rnd_dreamer": ("rnd", {"output_size": "rnd_rep_dim"}),
+    "apt_dreamer": ("apt", {"k": "knn_k"}),
+    "diayn_dreamer": ("diayn", {"skill_dim": "skill_dim"}),
+    "aps_dreamer": ("aps", {"skill_dim": "skill_dim", "k": "knn_k"}),
+}
 METRICS = {
     "kl_loss": "kl_loss",
     "observation_loss": "image_loss",
@@ -38,8 +49,7 @@ METRICS = {
     "prior_ent": "prior_entropy",
     "post_ent": "posterior_entropy",
     "model_grad_norm": "model_grad_norm",
-    "lbs_loss": "intrinsic_loss",
-    "lbs_grad_norm": "intrinsic_grad_norm",
+    "diayn_acc": "intrinsic_accuracy",
     "actor_loss": "actor_loss",
     "actor_grad_norm": "actor_grad_norm",
     "critic_loss": "critic_loss",
@@ -53,6 +63,11 @@ METRICS = {
 }
 # Metrics of the authors that this package does not log: a constant, and two that follow from others compared here.
 UNLOGGED = {"actor_ent_scale", "reward_normed_std", "critic_slow"}
+# With successor features the authors log the mean of ψ under this name, not of the value ψ · w.
+UNLOGGED_OF_SUCCESSOR_FEATURES = {"critic"}
+# What the authors call the intrinsic module in their metrics, and what they put before those of a skill's behaviour.
+INTRINSIC_METRIC = re.compile(r"^(lbs|disagreement|icm|rnd|diayn|aps)_(loss|grad_norm)$")
+SKILL_PREFIX = "skill_"
 MODULES = [
     (r"^encoder\.conv(\d+)", r"world_model.encoder.convs.\1"),
     (r"^decoder\.in\.", "world_model.decoder.input."),
@@ -63,6 +78,12 @@ MODULES = [
     (r"^actor\.(dense|out\.)", r"actor.body.\1"),
     (r"^target_critic\.", "slow_critic."),
     (r"^lbs\.", "intrinsic.surprise."),
+    (r"^p2e\.model(\d+)", r"intrinsic.models.\1"),
+    (r"^icm\.forward\.", "intrinsic.forward_model."),
+    (r"^rnd\.(predictor|target)\.conv(\d+)", r"intrinsic.\1.encoder.convs.\2"),
+    (r"^rnd\.(predictor|target)\.dense", r"intrinsic.\1.head.dense"),
+    (r"^diayn\.", "intrinsic."),
+    (r"^aps\.", "intrinsic."),
     (r"\.dense(\d+)\.", r".dense.\1."),
 ]
 
@@ -116,7 +137,7 @@ class Case:
         self._load_weights()
 
     def _make_agent(self) -> Agent:
-        size, method = self.size, METHODS[self.config["agent"]]
+        size, (method, hyperparameters) = self.size, METHODS[self.config["agent"]]
         net_arch = [size["units"]] * size["layers"]
         world_model = WorldModel(
             image_shape=self.data["update0.in.observation"].shape[2:],
@@ -130,7 +151,9 @@ class Case:
             gamma=self.config["discount"],
             discount_head=False,
         )
-        intrinsic = None if method is None or self.config["fine_tune"] else get_intrinsic_reward(method)
+        known = {**size, **self.config}
+        kwargs = {ours: known[theirs] for ours, theirs in hyperparameters.items()}
+        intrinsic = None if self.config["fine_tune"] else make_intrinsic_reward(method, kwargs)
         agent = Agent(world_model, net_arch, intrinsic)
         agent.reward_normalizer.momentum = self.config["reward_norm"]["momentum"]
         return agent
@@ -166,7 +189,7 @@ class Case:
                 yield name[len(prefix) :], value
 
     def _load_weights(self) -> None:
-        missing = set(self.agent.state_dict()) - {"reward_normalizer.scale"}
+        missing = {name for name, _ in self.agent.named_parameters()}
         with th.no_grad():
             for name, value in self.named("init."):
                 parameter = self.parameter(name)
@@ -184,7 +207,13 @@ class Case:
             entry["reward"].squeeze(-1),
             entry["is_first"].bool(),
             entry["is_terminal"].squeeze(-1).bool(),
+            entry.get("skill"),
         )
+
+    def imagination_skill(self, update: int) -> th.Tensor | None:
+        """The skills that the dreams of one update follow."""
+        given = self.data.get(f"update{update}.in.imagination_skill")
+        return None if given is None else th.as_tensor(given)
 
 
 @contextmanager
@@ -219,6 +248,8 @@ def check_forward(case: Case, worst: Worst) -> None:
 def check_updates(case: Case, worst: Worst) -> None:
     """Losses and imagination of every update, and the weights after the last."""
     last = case.size["updates"] - 1
+    successor_features = case.agent.intrinsic is not None and case.agent.intrinsic.successor_features
+    unlogged = UNLOGGED | (UNLOGGED_OF_SUCCESSOR_FEATURES if successor_features else set())
     for update in range(last + 1):
         seen: dict[str, th.Tensor] = {}
 
@@ -232,17 +263,28 @@ def check_updates(case: Case, worst: Worst) -> None:
             seen.update(features=imagination.feature, actions=imagination.action, rewards=reward, targets=returns)
             return metrics_of(imagination, raw_reward, reward, returns)
 
+        def spying_labels(posterior, batch, seen=seen):  # type: ignore[no-untyped-def]
+            seen["intrinsic_reward"] = labels(posterior, batch)
+            return seen["intrinsic_reward"]
+
         weights, metrics_of = actor_critic.discount_weights, actor_critic.behavior_metrics
+        labels = case.learner.reward_source.replay_reward
+        skill = case.imagination_skill(update)
         with (
             mock.patch.object(actor_critic, "discount_weights", spying_weights),
             mock.patch.object(actor_critic, "behavior_metrics", spying_metrics),
+            mock.patch.object(case.learner.reward_source, "replay_reward", spying_labels),
+            mock.patch.object(Skills, "sample", lambda *_, skill=skill: skill),
         ):
             metrics = case.learner.update(case.batch(update))
+        if f"update{update}.intrinsic_reward" in case.data:
+            worst.relative("losses", seen["intrinsic_reward"], case.data[f"update{update}.intrinsic_reward"])
         for name, theirs in case.named(f"update{update}.imagination."):
             worst.relative("imagination", seen[name], theirs)
         for name, theirs in case.named(f"update{update}.metric."):
-            if name not in UNLOGGED:
-                worst.relative("losses", metrics[METRICS[name]], theirs)
+            name = INTRINSIC_METRIC.sub(r"intrinsic_\2", name.removeprefix(SKILL_PREFIX))
+            if name not in unlogged:
+                worst.relative("losses", metrics[METRICS.get(name, name)], theirs)
     for name, theirs in case.named(f"update{last}.weights."):
         worst.absolute("weights", case.parameter(name), theirs)
 
@@ -276,7 +318,7 @@ def check_planner(case: Case, worst: Worst) -> None:
             embed = agent.world_model.encoder(agent.world_model.preprocess(given["in.observation"].unsqueeze(0)))
             is_first = th.tensor([step == 0])
             state = agent.world_model.rssm.posterior_step(LatentState(state.stoch, state.deter), action, embed, is_first)
-            action, mean = planner.plan(agent, state, mean, None, explore=True)
+            action, mean = planner.plan(PlannedAgent(agent, state.deter.new_zeros(1, 0)), state, mean, None, explore=True)
         worst.relative("planner", th.stack(values), case.data[f"plan{step}.values"])
         worst.relative("planner", mean, case.data[f"plan{step}.mean"])
         # The authors return the action unclipped; this package clips it before acting and storing.

@@ -153,7 +153,10 @@ def test_net_arch(refused, net_arch, message):
     [
         ({"preset": "huge"}, "Unknown preset 'huge'; known are .*'paper', 'small', 'tiny'"),
         ({"intrinsic_reward": "lbz"}, "Unknown intrinsic_reward 'lbz'; known are .*'lbs'"),
-        ({"intrinsic_reward": 3}, "intrinsic_reward must be a name, a subclass of IntrinsicReward or None, got 3"),
+        (
+            {"intrinsic_reward": 3},
+            "intrinsic_reward must be a name, a subclass or an instance of IntrinsicReward, or None, got 3",
+        ),
         ({"intrinsic_reward": dict}, "intrinsic_reward must be a name.*dict"),
         ({"planner": "cem"}, "Unknown planner 'cem'; known are .*'dyna_mpc', 'mppi'"),
         (

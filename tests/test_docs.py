@@ -60,12 +60,13 @@ def test_readme(small_world, tmp_path, capsys, monkeypatch):
 
 
 def test_an_intrinsic_reward_of_ones_own(small_world):
-    [block] = [block for block in code_blocks("docs/concepts.md") if "register_intrinsic_reward" in block]
+    [block] = [block for block in code_blocks("docs/methods.md") if "register_intrinsic_reward" in block]
     model = run(block, {"env": gymnasium.make("walker")})["model"]
     before = model.policy.agent.intrinsic.error.out.weight.clone()
     model.learn(100)
     assert model.phase_updates > 0 and not before.equal(model.policy.agent.intrinsic.error.out.weight)
-    assert "intrinsic_reward" in model._metrics.names
+    assert "intrinsic_reward" in model._metrics.sums
+    assert model.policy.agent.intrinsic.gain == 2.0
     model.save("own")
     assert dreamer_v2.DreamerV2.load("own").policy.agent.intrinsic is not None
 

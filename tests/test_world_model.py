@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import golden
 import pytest
 import torch as th
 import torch.nn.functional as F
+from conftest import infer
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -178,7 +177,9 @@ def test_free_nats_bound_the_mean_not_each_state():
 def test_loss_is_the_sum_of_its_parts(world_model, batch):
     model = world_model(discount_head=True)
     with golden.deterministic_draws():
-        loss, posterior, metrics = model.loss(batch, 0.0, 0.8, True)
+        posterior = infer(model, batch)
+        image = model.preprocess(batch.observation)
+        loss, metrics = model.loss(posterior, image, batch.reward, batch.is_terminal, 0.0, 0.8, True)
         image = model.preprocess(batch.observation)
         decoded = model.decoder(posterior.feature)
         normal = th.distributions.Normal
@@ -203,7 +204,8 @@ def test_rewards_reach_the_model_only_if_they_may(world_model, batch, trains):
     def gradients(reward):
         model.zero_grad()
         with golden.deterministic_draws():
-            model.loss(dataclasses.replace(batch, reward=reward), 0.0, 0.8, trains)[0].backward()
+            posterior, image = infer(model, batch), model.preprocess(batch.observation)
+            model.loss(posterior, image, reward, batch.is_terminal, 0.0, 0.8, trains)[0].backward()
         return {name: parameter.grad.clone() for name, parameter in model.named_parameters()}
 
     first, second = gradients(batch.reward), gradients(batch.reward + 5)

@@ -21,19 +21,68 @@ class Actor(nn.Module):
     :param feature_size: F
     :param action_size: A
     :param net_arch: widths of the hidden layers
+    :param skill_size: W, 0 without skills: π(a | z, w)
     """
 
-    def __init__(self, feature_size: int, action_size: int, net_arch: Sequence[int]):
+    def __init__(self, feature_size: int, action_size: int, net_arch: Sequence[int], skill_size: int = 0):
         super().__init__()
-        self.body = MLP(feature_size, net_arch, action_size)
+        self.body = MLP(feature_size + skill_size, net_arch, action_size)
         self.out_std = nn.Linear(self.body.out.in_features, action_size)
         self.action_size = action_size
 
-    def forward(self, feature: th.Tensor) -> BoundedNormal:
-        """(…, F) → distribution over (…, A)."""
-        hidden = self.body.hidden(feature)
+    def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal:
+        """(…, F) and the skill followed there, (…, W), → distribution over (…, A)."""
+        hidden = self.body.hidden(_with_skill(feature, skill))
         std = 2 * th.sigmoid(self.out_std(hidden) / 2) + MIN_STD
         return BoundedNormal(th.tanh(self.body.out(hidden)), std)
+
+
+class Critic(MLP):
+    """v(z): the mean of a unit normal over the λ-return.
+
+    :param feature_size: F
+    :param net_arch: widths of the hidden layers
+    :param skill_size: W, 0 without skills: v(z, w)
+    :param outputs: of the network
+    """
+
+    def __init__(self, feature_size: int, net_arch: Sequence[int], skill_size: int = 0, outputs: int = 1):
+        super().__init__(feature_size + skill_size, net_arch, outputs)
+
+    def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> th.Tensor:
+        """Values of states, (…, F) and the skill followed there, (…, W), → (…)."""
+        return super().forward(_with_skill(feature, skill))
+
+    def loss(self, value: th.Tensor, target: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        """Weighted negative log-likelihood of the targets under a unit normal at the critic's value, all (H, N)."""
+        return (weight * distributions.unit_normal_nll(value, target)).mean()
+
+
+class SuccessorCritic(Critic):
+    """v(z, w) = ψ(z, w) · w with successor features ψ (APS).
+
+    :param feature_size: F
+    :param net_arch: widths of the hidden layers
+    :param skill_size: W
+    """
+
+    def __init__(self, feature_size: int, net_arch: Sequence[int], skill_size: int):
+        super().__init__(feature_size, net_arch, skill_size, outputs=skill_size)
+
+    def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> th.Tensor:
+        assert skill is not None
+        return (super().forward(feature, skill) * skill).sum(-1)
+
+    def loss(self, value: th.Tensor, target: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        """Weighted squared error, all (H, N)."""
+        return (weight * (value - target).square()).mean()
+
+
+def _with_skill(feature: th.Tensor, skill: th.Tensor | None) -> th.Tensor:
+    """[z, w]; one skill each is followed through any dimensions before the last two of ``feature``."""
+    if skill is None:
+        return feature
+    return th.cat([feature, skill.expand(*feature.shape[:-1], -1)], -1)
 
 
 class RewardNormalizer(nn.Module):
@@ -82,11 +131,6 @@ def actor_loss(target: th.Tensor, weight: th.Tensor) -> th.Tensor:
 def discount_weights(discount: th.Tensor) -> th.Tensor:
     """How likely each state is to be reached: the product of the discounts before it, (H + 1, N) → (H, N)."""
     return th.cat([th.ones_like(discount[:1]), discount[:-2].cumprod(0)])
-
-
-def critic_loss(value: th.Tensor, target: th.Tensor, weight: th.Tensor) -> th.Tensor:
-    """Weighted negative log-likelihood of the targets under a unit normal at the critic's value, all (H, N)."""
-    return (weight * distributions.unit_normal_nll(value, target)).mean()
 
 
 def behavior_metrics(imagination: Imagination, raw_reward: th.Tensor, reward: th.Tensor, returns: th.Tensor) -> Metrics:

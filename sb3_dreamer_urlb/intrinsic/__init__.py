@@ -1,14 +1,28 @@
 """Intrinsic rewards: one short file a method, one line here each."""
 
-from sb3_dreamer_urlb.intrinsic.base import (
-    IntrinsicReward,
-    RewardSource,
-    TaskReward,
-    get_intrinsic_reward,
-    register_intrinsic_reward,
-)
+from sb3_dreamer_urlb.intrinsic.aps import APS
+from sb3_dreamer_urlb.intrinsic.apt import APT
+from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead, RewardSource
+from sb3_dreamer_urlb.intrinsic.diayn import DIAYN
+from sb3_dreamer_urlb.intrinsic.icm import ICM
 from sb3_dreamer_urlb.intrinsic.lbs import LBS
+from sb3_dreamer_urlb.intrinsic.plan2explore import Plan2Explore
+from sb3_dreamer_urlb.intrinsic.random_actions import RandomActions
+from sb3_dreamer_urlb.intrinsic.registry import (
+    get_intrinsic_reward,
+    make_intrinsic_reward,
+    register_intrinsic_reward,
+    registered_intrinsic_rewards,
+)
+from sb3_dreamer_urlb.intrinsic.rnd import RND
+from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
+from sb3_dreamer_urlb.intrinsic.skills import OneHotSkills, Skills, UnitSkills
 
+register_intrinsic_reward("icm", ICM)
+register_intrinsic_reward("plan2explore", Plan2Explore)
+register_intrinsic_reward("rnd", RND)
 register_intrinsic_reward("lbs", LBS)
-
-__all__ = ["LBS", "IntrinsicReward", "RewardSource", "TaskReward", "get_intrinsic_reward", "register_intrinsic_reward"]
+register_intrinsic_reward("apt", APT)
+register_intrinsic_reward("diayn", DIAYN)
+register_intrinsic_reward("aps", APS)
+register_intrinsic_reward("random", RandomActions)

@@ -1,90 +1,92 @@
-"""What a reward inside imagination is, and the registry of the intrinsic ones.
-
-A new way to explore is one subclass of :class:`IntrinsicReward` and one call of :func:`register_intrinsic_reward`.
-"""
+"""Where rewards come from: one interface for the task's reward and for every intrinsic one."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
+#: features (…, F) → predicted rewards (…)
+RewardHead = Callable[[th.Tensor], th.Tensor]
 
-class RewardSource(ABC):
-    """Where the rewards of imagined states come from: the task's reward head, or an intrinsic reward."""
+
+class RewardSource(nn.Module):
+    """Where the rewards of imagined states come from. As it stands: from the environment, through the reward head.
+
+    The world model's reward head learns :meth:`replay_reward`, the actor seeks :meth:`reward`. Fine-tuning uses this class
+    itself, pre-training one of the subclasses below :class:`IntrinsicReward`.
+    """
 
     #: μ of the reward normaliser; 1 switches it off (spec/algorithms §2)
     momentum: ClassVar[float] = 1.0
 
-    @abstractmethod
-    def reward(self, imagination: Imagination) -> th.Tensor:
-        """Rewards of all imagined states, with gradients to them: float (H + 1, N)."""
-
-
-class TaskReward(RewardSource):
-    """Fine-tuning: the world model's reward head, which learnt the environment's reward.
-
-    :param head: features (…, F) → reward (…)
-    """
-
-    def __init__(self, head: nn.Module):
-        self.head = head
-
-    def reward(self, imagination: Imagination) -> th.Tensor:
-        return self.head(imagination.feature)
-
-
-class IntrinsicReward(nn.Module, RewardSource):
-    """A reward the agent makes for itself while it pre-trains.
-
-    Subclasses build their networks in ``__init__`` and say what those learn in :meth:`loss`; the learner owns the
-    optimiser. What must be saved is a parameter or a buffer.
-
-    :param sizes: sizes of the world model it reads
-    """
-
-    momentum: ClassVar[float] = 0.95
-    #: entropy bonus of the actor while exploring with this reward
-    ent_coef: ClassVar[float] = 0.0
-
-    def __init__(self, sizes: ModelSizes):
-        super().__init__()
-        self.sizes = sizes
-
-    @abstractmethod
-    def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics]:
-        """What the module learns from a replayed batch.
+    def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics] | None:
+        """What the module itself learns from a replayed batch; None if there is nothing to learn.
 
         :param posterior: of the world model's pass of this same update, *before* its optimiser step; detached
         :param batch: the replayed rows
         :return: loss (scalar) and metrics (detached scalars, logged as ``train/intrinsic_<name>``)
         """
+        return None
+
+    def replay_reward(self, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
+        """What the reward head learns for the replayed states: the environment's rewards, float (B, T).
+
+        Called after the module's own step.
+
+        :param posterior: as for :meth:`loss`
+        :param batch: the replayed rows
+        """
+        return batch.reward
+
+    def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
+        """Rewards of all imagined states, with gradients to them: the reward head's mean, float (H + 1, N).
+
+        :param imagination: what the actor dreamt
+        :param reward_head: of the world model
+        """
+        return reward_head(imagination.feature)
 
 
-_REGISTRY: dict[str, type[IntrinsicReward]] = {}
+class IntrinsicReward(RewardSource):
+    """A reward the agent makes for itself while it pre-trains.
 
+    A subclass takes its hyperparameters in ``__init__`` and makes its networks in :meth:`build`. Then it overrides any of
 
-def register_intrinsic_reward(name: str, method: type[IntrinsicReward]) -> None:
-    """Make ``DreamerV2(..., intrinsic_reward=name)`` use ``method``.
+    - :meth:`loss`: what its networks learn; the learner owns the optimiser,
+    - :meth:`reward`: where the reward can be computed in imagination, or
+    - :meth:`replay_reward`: where it needs real observations; the world model's reward head then learns it.
 
-    :param name: what users write
-    :param method: subclass of :class:`IntrinsicReward`
-    :raises ValueError: if another class has that name already
+    What snapshots must hold is a parameter or a buffer. See docs/methods.md for an example.
     """
-    if _REGISTRY.get(name, method) is not method:
-        raise ValueError(f"The intrinsic reward {name!r} is already {_REGISTRY[name].__qualname__}.")
-    _REGISTRY[name] = method
 
+    momentum: ClassVar[float] = 0.95
+    #: entropy bonus of the actor while exploring with this reward
+    ent_coef: ClassVar[float] = 0.0
+    #: False: nothing for an actor to learn, pre-training acts uniformly at random
+    trains_actor: ClassVar[bool] = True
+    #: the critic learns successor features ψ with value = ψ · w instead of values (APS)
+    successor_features: ClassVar[bool] = False
 
-def get_intrinsic_reward(name: str) -> type[IntrinsicReward]:
-    """The class registered as ``name``.
+    def __init__(self) -> None:
+        super().__init__()
+        #: what conditions actor and critic, None for a method without skills
+        self.skills: Skills | None = None
 
-    :raises ValueError: for an unknown name; the message lists the known ones
-    """
-    if name not in _REGISTRY:
-        raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(_REGISTRY)}, and None for the task's reward.")
-    return _REGISTRY[name]
+    def build(self, sizes: ModelSizes) -> None:
+        """Make the networks. Called once, on a copy of what the user handed in.
+
+        :param sizes: of the world model whose features are read
+        """
+
+    def check(self, particles: int) -> None:
+        """Refuse hyperparameters that do not fit the run, before any time is spent.
+
+        :param particles: imagined states of an update, (H + 1) · B · T
+        :raises ValueError: if they do not
+        """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
@@ -16,14 +16,13 @@ class LBS(IntrinsicReward):
     In imagination there is no observation, so a head learns to predict the surprise from features.
     """
 
-    def __init__(self, sizes: ModelSizes):
-        super().__init__(sizes)
+    def build(self, sizes: ModelSizes) -> None:
         self.surprise = MLP(sizes.feature, sizes.net_arch)
 
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics]:
         """Unit-normal NLL of the predicted surprise of each replayed state."""
         loss = distributions.unit_normal_nll(self.surprise(posterior.feature), posterior.kl).mean()
-        return loss, {"reward": posterior.kl.mean()}
+        return loss, {}
 
-    def reward(self, imagination: Imagination) -> th.Tensor:
+    def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
         return self.surprise(imagination.feature)

@@ -23,22 +23,25 @@ class Episode:
 
     :param observation: the episode's first observation
     :param action_size: A
+    :param skill: under which the first action is chosen, (W,)
     """
 
-    def __init__(self, observation: np.ndarray, action_size: int):
+    def __init__(self, observation: np.ndarray, action_size: int, skill: np.ndarray):
         capacity = 128
         self.observation = np.empty((capacity, *observation.shape), observation.dtype)
         self.action = np.zeros((capacity, action_size), np.float32)
         self.reward = np.zeros(capacity, np.float32)
         self.is_terminal = np.zeros(capacity, bool)
+        self.skill = np.zeros((capacity, len(skill)), np.float32)
         self.length = 1
         self.observation[0] = observation
+        self.skill[0] = skill
 
     def __len__(self) -> int:
         return self.length
 
-    def append(self, observation: np.ndarray, action: np.ndarray, reward: float, is_terminal: bool) -> None:
-        """Add the row that ``action`` led to."""
+    def append(self, observation: np.ndarray, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray) -> None:
+        """Add the row that ``action``, chosen under ``skill``, led to."""
         if self.length == len(self.reward):
             self._resize(2 * self.length)
         t = self.length
@@ -46,6 +49,7 @@ class Episode:
         self.action[t] = action
         self.reward[t] = reward
         self.is_terminal[t] = is_terminal
+        self.skill[t] = skill
         self.length += 1
 
     def finish(self) -> Episode:
@@ -54,7 +58,7 @@ class Episode:
         return self
 
     def _resize(self, capacity: int) -> None:
-        for name in ("observation", "action", "reward", "is_terminal"):
+        for name in ("observation", "action", "reward", "is_terminal", "skill"):
             old = getattr(self, name)
             new = np.empty((capacity, *old.shape[1:]), old.dtype)
             new[: self.length] = old[: self.length]
@@ -75,6 +79,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param max_episode_rows: longer episodes are stored in pieces of this many rows, so that endless ones are drawn too
     :param seed: of the sampler
     :param phase: name of the phase that filled it; a fine-tuning refuses a pre-training's buffer
+    :param skill_size: W, size of the skills to store with each row, 0 for none
     """
 
     def __init__(
@@ -89,6 +94,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         max_episode_rows: int = 5000,
         seed: int | None = None,
         phase: str = "",
+        skill_size: int = 0,
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -102,6 +108,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         # A piece must fit into the buffer, or it would be all that is ever held.
         self.max_episode_rows = min(max_episode_rows, buffer_size)
         self.phase = phase
+        self.skill_size = skill_size
         self.rng = np.random.default_rng(seed)
         self.reset()
 
@@ -127,6 +134,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         reward: np.ndarray,
         done: np.ndarray,
         infos: list[dict[str, Any]],
+        skill: np.ndarray | None = None,
     ) -> None:
         """Store one step of every environment.
 
@@ -136,13 +144,18 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param reward: (n_envs,)
         :param done: (n_envs,)
         :param infos: ``TimeLimit.truncated`` tells truncation from termination
+        :param skill: that each action followed, (n_envs, W); None without skills
+        :raises ValueError: for skills of another shape
         """
+        skill = np.zeros((self.n_envs, 0), np.float32) if skill is None else skill
+        if skill.shape != (self.n_envs, self.skill_size):
+            raise ValueError(f"Skills must have the shape {(self.n_envs, self.skill_size)}, got {skill.shape}.")
         for i in range(self.n_envs):
             episode = self.open[i]
             if episode is None:
-                episode = self.open[i] = Episode(np.asarray(obs[i]), self.action_dim)
+                episode = self.open[i] = Episode(np.asarray(obs[i]), self.action_dim, skill[i])
             terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
-            episode.append(next_obs[i], action[i].reshape(-1), float(reward[i]), terminal)
+            episode.append(next_obs[i], action[i].reshape(-1), float(reward[i]), terminal, skill[i])
             if done[i] or len(episode) >= self.max_episode_rows:
                 self._finish(i)
 
@@ -186,6 +199,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         action = np.empty((batch_size, length, self.action_dim), np.float32)
         reward = np.empty((batch_size, length), np.float32)
         is_terminal = np.empty((batch_size, length), bool)
+        skill = np.empty((batch_size, length, self.skill_size), np.float32)
         for b, index in enumerate(self.rng.integers(len(self.episodes), size=batch_size)):
             episode = self.episodes[index]
             start = self.rng.integers(len(episode) - length + 1)
@@ -194,8 +208,9 @@ class SequenceReplayBuffer(ReplayBuffer):
             action[b] = episode.action[rows]
             reward[b] = episode.reward[rows]
             is_terminal[b] = episode.is_terminal[rows]
+            skill[b] = episode.skill[rows]
         is_first = np.zeros((batch_size, length), bool)
         is_first[:, 0] = True
         reward = self._normalize_reward(reward, env).astype(np.float32, copy=False)
-        parts = (observation, action, reward, is_first, is_terminal)
+        parts = [observation, action, reward, is_first, is_terminal, *([skill] if self.skill_size else [])]
         return SequenceBatch(*(th.from_numpy(part).to(self.device, non_blocking=True) for part in parts))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch as th
 import torch.nn.functional as F
 from torch import nn
@@ -10,16 +12,18 @@ KERNEL, STRIDE = 4, 2
 
 
 class ConvEncoder(nn.Module):
-    """Strided convolutions, ELU after each, flattened channel-first (spec/algorithms §1).
+    """Strided convolutions, an activation after each, flattened channel-first (spec/algorithms §1).
 
     At 64×64 these are DreamerV2's four stages, 64 → 31 → 14 → 6 → 2; other sizes take as many stages as fit.
 
     :param image_shape: (channels, height, width), height and width at least 16
     :param depth: channels of the first stage; they double with each stage, up to 8 × depth
+    :param activation: after each convolution
     """
 
-    def __init__(self, image_shape: tuple[int, int, int], depth: int):
+    def __init__(self, image_shape: tuple[int, int, int], depth: int, activation: Callable[[th.Tensor], th.Tensor] = F.elu):
         super().__init__()
+        self.activation = activation
         channels, height, width = image_shape
         self.convs = nn.ModuleList()
         while min(height, width) >= KERNEL:
@@ -36,5 +40,5 @@ class ConvEncoder(nn.Module):
         # Channels last is a third faster on CPU, from small to paper size.
         x = image.flatten(0, -4).contiguous(memory_format=th.channels_last)
         for conv in self.convs:
-            x = F.elu(conv(x))
+            x = self.activation(conv(x))
         return x.reshape(image.shape[:-3] + (self.embed_size,))

@@ -11,16 +11,16 @@ from torch import nn
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.distributions import BoundedNormal
 from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Posterior
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder
 from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 
 class Acts(Protocol):
-    """Anything that turns features into an action distribution."""
+    """Anything that turns features, and the skills followed, into an action distribution."""
 
-    def __call__(self, feature: th.Tensor) -> BoundedNormal: ...
+    def __call__(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal: ...
 
 
 class WorldModel(nn.Module):
@@ -60,7 +60,7 @@ class WorldModel(nn.Module):
         self.decoder = ConvDecoder(feature, image_shape, cnn_depth)
         self.reward = MLP(feature, net_arch)
         self.discount_logit = MLP(feature, net_arch) if discount_head else None
-        self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch))
+        self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch), image_shape, cnn_depth)
 
     @staticmethod
     def preprocess(observation: th.Tensor) -> th.Tensor:
@@ -70,33 +70,41 @@ class WorldModel(nn.Module):
     # -- learning ------------------------------------------------------------------------------------------------------
 
     def loss(
-        self, batch: SequenceBatch, free_nats: float, kl_balance: float, reward_trains_model: bool
-    ) -> tuple[th.Tensor, Posterior, Metrics]:
+        self,
+        posterior: Posterior,
+        image: th.Tensor,
+        reward: th.Tensor,
+        is_terminal: th.Tensor,
+        free_nats: float,
+        kl_balance: float,
+        reward_trains_model: bool,
+    ) -> tuple[th.Tensor, Metrics]:
         """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
 
-        :param batch: what was replayed, (B, T, …)
+        :param posterior: what :meth:`observe` inferred about it, with its graph
+        :param image: that it was inferred from, float (B, T, C, height, width)
+        :param reward: what the reward head learns, float (B, T)
+        :param is_terminal: bool (B, T), what the discount head learns
         :param free_nats: the KL below which the model is not pushed; applied to the batch mean
         :param kl_balance: share of the KL's gradient that trains the prior
         :param reward_trains_model: False stops the reward head's gradient before the model (pre-training)
-        :return: loss (scalar), the posterior with its graph, and metrics (detached scalars)
+        :return: loss (scalar) and metrics (detached scalars)
         """
-        image = self.preprocess(batch.observation)
-        posterior = self.observe(image, batch.action, batch.is_first)
         kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
         image_nll = distributions.image_nll(self.decoder(posterior.feature), image)
         reward_feature = posterior.feature if reward_trains_model else posterior.feature.detach()
-        reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), batch.reward).mean()
+        reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), reward).mean()
         loss = kl_loss + image_nll + reward_nll
         metrics = {"kl_loss": kl_loss, "image_loss": image_nll, "reward_loss": reward_nll, "kl": posterior.kl.mean()}
         if self.discount_logit is not None:
-            goes_on = (~batch.is_terminal).to(image.dtype)
+            goes_on = (~is_terminal).to(image.dtype)
             discount_nll = distributions.bernoulli_nll(self.discount_logit(posterior.feature), goes_on).mean()
             loss = loss + discount_nll
             metrics["discount_loss"] = discount_nll
         with th.no_grad():
             metrics["prior_entropy"] = distributions.categorical_entropy(posterior.prior_logits).mean()
             metrics["posterior_entropy"] = distributions.categorical_entropy(posterior.post_logits).mean()
-        return loss, posterior, {name: value.detach() for name, value in metrics.items()}
+        return loss, {name: value.detach() for name, value in metrics.items()}
 
     def observe(self, image: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> Posterior:
         """Infer the states behind sequences of images.
@@ -120,24 +128,25 @@ class WorldModel(nn.Module):
 
     # -- dreaming ------------------------------------------------------------------------------------------------------
 
-    def imagine(self, actor: Acts, start: LatentState, horizon: int) -> Imagination:
+    def imagine(self, actor: Acts, start: LatentState, horizon: int, skill: th.Tensor | None = None) -> Imagination:
         """Let the actor act inside the model (paper §2; gradients flow through the dynamics to its actions).
 
         :param actor: sees features cut from the graph
         :param start: where the dreams begin, (N, …)
         :param horizon: H, number of steps
+        :param skill: that the actor follows in each dream, float (N, W)
         """
         state = start
         action = start.deter.new_zeros(start.deter.shape[0], self.sizes.action)
         features, actions, entropies = [state.feature], [action], []
         for _ in range(horizon):
-            policy = actor(features[-1].detach())
+            policy = actor(features[-1].detach(), skill)
             action = policy.sample()
             state = self.rssm.prior_step(state, action)
             features.append(state.feature)
             actions.append(action)
             entropies.append(policy.entropy())
-        return Imagination(th.stack(features), th.stack(actions), th.stack(entropies))
+        return Imagination(th.stack(features), th.stack(actions), th.stack(entropies), skill)
 
     def discount(self, feature: th.Tensor) -> th.Tensor:
         """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…)."""

@@ -1,0 +1,83 @@
+"""Random Network Distillation (Burda et al., 2019; paper appendix B): seek images that are not yet known by heart."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
+from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.types import Metrics, ModelSizes, Posterior, SequenceBatch
+from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
+from sb3_dreamer_urlb.world_model.world_model import WorldModel
+
+PIXEL_BOUND = 5.0
+
+
+class ImageNet(nn.Module):
+    """An encoder and three layers, all orthogonal.
+
+    :param sizes: of the world model; embedding and widths are the same
+    :param outputs: size of the output
+    """
+
+    def __init__(self, sizes: ModelSizes, outputs: int):
+        super().__init__()
+        self.encoder = ConvEncoder(sizes.image_shape, sizes.cnn_depth)
+        for conv in self.encoder.convs:
+            assert isinstance(conv, nn.Conv2d) and conv.bias is not None
+            nn.init.orthogonal_(conv.weight, math.sqrt(2))
+            nn.init.zeros_(conv.bias)
+        self.head = ReLUNet([sizes.embed, sizes.embed, sizes.embed, outputs], orthogonal=True)
+
+    def forward(self, image: th.Tensor) -> th.Tensor:
+        """(n, C, height, width) → (n, outputs)."""
+        return self.head(self.encoder(image))
+
+
+class RND(IntrinsicReward):
+    """r_t = ‖f(x_t) − f̄(x_t)‖² / σ: the error of a predictor of a fixed random network, in units of its running deviation.
+
+    Computed on replayed images; the reward head carries it into imagination.
+
+    :param output_size: of the two networks
+    :raises ValueError: if it is not positive
+    """
+
+    momentum: ClassVar[float] = 1.0
+
+    def __init__(self, output_size: int = 512):
+        super().__init__()
+        if not is_integer(output_size) or output_size < 1:
+            raise ValueError(f"output_size must be a positive integer, got {output_size!r}.")
+        self.output_size = output_size
+
+    def build(self, sizes: ModelSizes) -> None:
+        self.predictor = ImageNet(sizes, self.output_size)
+        self.target = ImageNet(sizes, self.output_size).requires_grad_(False)
+        self.error_moments = RunningMoments()
+
+    def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics]:
+        """Mean squared error of the predictor, mean over the outputs."""
+        return self._error(batch).mean(), {}
+
+    def replay_reward(self, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
+        with th.no_grad():
+            error = self._error(batch)
+            self.error_moments.update(error)
+            return (error / self.error_moments.std).view(batch.reward.shape)
+
+    def _error(self, batch: SequenceBatch) -> th.Tensor:
+        """(B·T,)"""
+        image = WorldModel.preprocess(batch.observation).flatten(0, 1)
+        # Each batch is its own reference: whitened per channel, and no outlier beyond five deviations.
+        image = F.batch_norm(image, None, None, training=True).clamp(-PIXEL_BOUND, PIXEL_BOUND)
+        with th.no_grad():
+            target = self.target(image)
+        return (self.predictor(image) - target).square().mean(-1)
