@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import time
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.intrinsic import registered_intrinsic_rewards
 
-COLUMNS = ("method", "updates", "reward", "± ", "module loss", "fine-tuned", "minutes", "")
+COLUMNS = ("method", "updates", "intrinsic reward", "spread", "module's loss", "fine-tuned", "minutes", "")
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class TourConfig:
 
     :param out: folder of the snapshots
     :param methods: which, all registered ones if empty
-    :param domain_task: pre-training and fine-tuning task
+    :param task: pre-training and fine-tuning task, ``<domain>-<task>``
     :param pretrain_frames: environment frames of pre-training
     :param finetune_frames: environment frames of fine-tuning
     :param episodes: evaluation episodes
@@ -160,19 +161,26 @@ def run_tour(config: TourConfig) -> list[Visit]:
     """
     config.out.mkdir(parents=True, exist_ok=True)
     methods = config.methods or tuple(registered_intrinsic_rewards())
-    # Not fork: a child that inherits a renderer hangs.
-    context = multiprocessing.get_context("forkserver")
     print(_row(*COLUMNS), flush=True)
-    with ProcessPoolExecutor(config.jobs, mp_context=context) as pool:
-        visits = []
-        for seen in pool.map(visit, [config] * len(methods), methods):
-            visits.append(seen)
-            print(_describe(seen), flush=True)
+    visits = []
+    for seen in _visit_all(config, methods):
+        visits.append(seen)
+        print(_describe(seen), flush=True)
     env = gymnasium.make(f"urlb/{config.task}-v0", fast_render=True)
     returns = evaluate(RandomPolicy(env.action_space, config.seed), env, config.episodes)
     env.close()
     print(f"Random policy: {np.mean(returns):.0f} ± {np.std(returns):.0f}. Snapshots in {config.out}/.")
     return visits
+
+
+def _visit_all(config: TourConfig, methods: Sequence[str]) -> Iterator[Visit]:
+    if config.jobs == 1:
+        yield from (visit(config, method) for method in methods)
+        return
+    # Not fork: a child that inherits a renderer hangs.
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(config.jobs, mp_context=context) as pool:
+        yield from pool.map(visit, [config] * len(methods), methods)
 
 
 def _describe(seen: Visit) -> str:
