@@ -15,7 +15,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {},
     # Learns on two CPU cores, in thousands of updates instead of tens of thousands. Found by trial on walker stand, see
     # docs/results.md: a faster actor saturates before the model is any good, and without the larger entropy bonus it also
-    # stops exploring; the slow critic must keep up; so few samples need more of the actor's trajectories among them.
+    # stops exploring; the slow critic must keep up; so few samples need more of the actor's trajectories among them, and
+    # until the model is good, acting with them only adds noise to the data.
     "small": {
         "learning_rate": 1e-3,
         "actor_learning_rate": 1e-4,
@@ -27,7 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "buffer_size": 100_000,
         "ent_coef": 1e-3,
         "target_update_interval": 25,
-        "planner_delay": 2500,
+        "planner_delay": 4500,
         "skill_selection_starts": 500,
         "planner_kwargs": {"n_samples": 64, "iterations": 6, "top_k": 8, "mixture": 0.5},
         "policy_kwargs": {
