@@ -288,7 +288,7 @@ def test_a_switch_is_found_again_by_repeated_learns_and_after_loading(tiny_model
     for _ in range(4):
         model.learn(16, callback=PhaseSwitchCallback(32))
         phases.append((model.phase, model.phase_timesteps))
-    assert phases == [("pretraining", 16), ("finetuning", 0), ("finetuning", 16), ("finetuning", 32)]
+    assert phases == [("pretraining", 16), ("pretraining", 32), ("finetuning", 16), ("finetuning", 32)]
     model = tiny_model(vec_env(), intrinsic_reward="lbs").learn(16)
     model.save(tmp_path / "half")
     model = DreamerV2.load(tmp_path / "half", env=vec_env(), device="cpu")
