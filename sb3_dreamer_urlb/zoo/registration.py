@@ -18,13 +18,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
-from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
+from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
 
 #: rl_zoo3's name of the algorithm; the hub looks for the class's name in lower case
 ALGORITHM = "dreamerv2"
 #: what ``train`` reads without ``-conf``, in a checkout of the repository
 DEFAULT_CONFIG = Path(__file__).parents[2] / "zoo_configs" / "lbs.yml"
+#: by name, because rl_zoo3 makes one for each trial
+FINITE = f"{FiniteWeightsCallback.__module__}.{FiniteWeightsCallback.__qualname__}"
 
 
 def register() -> None:
@@ -69,8 +71,11 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
-    """Tell the snapshots their folder, whose number rl_zoo3 chooses."""
+    """Tell the snapshots their folder, whose number rl_zoo3 chooses; let each trial of ``-optimize`` stop at NaN."""
     original(manager)
+    if manager.optimize_hyperparameters:
+        given = manager.specified_callbacks or []
+        manager.specified_callbacks = [*(given if isinstance(given, list) else [given]), FINITE]
     for callback in manager.callbacks:
         if isinstance(callback, RunSnapshotCallback):
             callback.save_path = str(Path(manager.save_path) / "snapshots")

@@ -1,4 +1,4 @@
-"""What rl_zoo3's ``-optimize`` tries. A trial whose numbers become NaN ends in a ValueError, which prunes it."""
+"""What rl_zoo3's ``-optimize`` tries. A trial whose weights become NaN is pruned (``FiniteWeightsCallback``)."""
 
 from __future__ import annotations
 
