@@ -263,6 +263,8 @@ def test_mistakes_are_named(zoo, monkeypatch):
     run = train(zoo, STAND, 8, "lbs", params=TINY)
     with pytest.raises(ValueError, match=r"preset='tiny', the configuration says 'small'"):
         train(zoo, STAND, 8, "small/lbs", "-i", f"{run}/urlb-walker-stand-v0.zip")
+    with pytest.raises(ValueError, match=r"intrinsic_reward='lbs', the configuration says None"):
+        train(zoo, STAND, 8, "scratch", "-i", f"{run}/urlb-walker-stand-v0.zip")
     with pytest.raises(ValueError, match="FineTuneCallback needs a pre-trained model"):
         train(zoo, FLIP, 8, "finetune", params=TINY[:1])
     monkeypatch.setattr("sb3_dreamer_urlb.zoo.registration.DEFAULT_CONFIG", Path("nowhere.yml"))

@@ -63,7 +63,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
 
     :raises ValueError: if there is no file to read
     """
-    if manager.args.conf_file is None:
+    if getattr(manager.args, "conf_file", manager.config) is None:
         if not DEFAULT_CONFIG.is_file():
             raise ValueError("Name a configuration with -conf; this package's repository has some in zoo_configs/.")
         manager.config = str(DEFAULT_CONFIG)
@@ -84,20 +84,21 @@ def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
 def _load_pretrained_agent(
     original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any], env: VecEnv
 ) -> BaseAlgorithm:
-    """``-i`` takes a snapshot's sizes from the snapshot, and only takes a replay buffer that belongs to its phase.
+    """``-i`` takes a snapshot's networks from the snapshot, and only takes a replay buffer that belongs to its phase.
 
-    :raises ValueError: for a snapshot that another preset made
+    :raises ValueError: for a snapshot that was made with other networks than the configuration says
     """
-    preset = hyperparams.pop("preset", None)
+    expected = {name: hyperparams.pop(name) for name in ("preset", "intrinsic_reward") if name in hyperparams}
     fine_tunes = any(isinstance(callback, FineTuneCallback) for callback in manager.callbacks)
     load = functools.partialmethod(_load_fitting_buffer, DreamerV2.load_replay_buffer, fine_tunes)
     with mock.patch.object(DreamerV2, "load_replay_buffer", load):
         model = original(manager, hyperparams, env)
-    if preset is not None and preset != model.preset:
-        raise ValueError(
-            f"{manager.trained_agent} was made with preset={model.preset!r}, the configuration says {preset!r}: "
-            "a snapshot keeps its sizes."
-        )
+    for name, value in expected.items():
+        if value != getattr(model, name):
+            raise ValueError(
+                f"{manager.trained_agent} was made with {name}={getattr(model, name)!r}, the configuration says {value!r}: "
+                "a snapshot keeps its networks."
+            )
     return model
 
 
