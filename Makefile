@@ -18,7 +18,7 @@ GOLDEN ?= ../shared/golden/dreamer_finetune.npz ../shared/golden/lbs_pretrain.np
 
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := $(wildcard sb3_dreamer_urlb tests benchmarks)
+SOURCES := $(wildcard sb3_dreamer_urlb tests benchmarks custom_envs.py)
 export PYTHON TORCH_INDEX VENV
 
 # Workers share the cores: one thread each, for torch and for the software renderer.

@@ -13,7 +13,7 @@ from sb3_dreamer_urlb.envs import register_envs
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
     from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
-    from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
+    from sb3_dreamer_urlb.phases import FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
     from sb3_dreamer_urlb.planning import PlannerConfig
     from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
     from sb3_dreamer_urlb.replay import SequenceReplayBuffer
@@ -22,6 +22,7 @@ _MODULES = {
     "CnnPolicy": "policies",
     "DreamerPolicy": "policies",
     "DreamerV2": "dreamer_v2",
+    "FineTuneCallback": "phases",
     "IntrinsicReward": "intrinsic",
     "PhaseSwitchCallback": "phases",
     "PlannerConfig": "planning",
@@ -36,6 +37,7 @@ __all__ = [
     "CnnPolicy",
     "DreamerPolicy",
     "DreamerV2",
+    "FineTuneCallback",
     "IntrinsicReward",
     "PhaseSwitchCallback",
     "PlannerConfig",

@@ -90,8 +90,9 @@ def keeps_actor(domain: str | None) -> bool:
 class PhaseSwitchCallback(BaseCallback):
     """Turn a run from pre-training to fine-tuning inside one ``model.learn(...)``.
 
-    The switch happens at the end of the rollout in which the phase's frames are reached. It depends only on the model's
-    own phase and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless.
+    The switch happens at the end of the rollout in which the phase's frames are reached, unless ``learn`` ends with it:
+    then the model stays pre-trained, and the next ``learn`` begins with the switch. It depends only on the model's own phase
+    and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless.
 
     :param pretrain_frames: length of the pre-training in environment frames (agent steps × action repeat)
     :param env: the fine-tuning environment; None stays in the same one
@@ -128,14 +129,57 @@ class PhaseSwitchCallback(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
+    def _on_training_start(self) -> None:
+        # A learn() before this one, perhaps in another process, ended with the pre-training.
+        self._switch_if_due()
+
     def _on_rollout_end(self) -> None:
-        # Between rollouts, because a rollout holds on to its environment and replay buffer.
+        # Between rollouts, because a rollout holds on to its environment and replay buffer. If no step is left for the
+        # task, the pre-trained agent is what the caller wants to have.
+        if self.model.num_timesteps < self.model._total_timesteps:
+            self._switch_if_due()
+
+    def _switch_if_due(self) -> None:
         model: DreamerV2 = self.model  # type: ignore[assignment]
         if model.phase != PRETRAINING or model.phase_frames < self.pretrain_frames:
             return
         if self.verbose >= 1:
             print(f"Pre-training ends after {model.phase_frames} frames; fine-tuning begins.")
         model.fine_tune(self.env, self.keep_actor, self.keep_critic)
+        model.restart_episodes()
+
+
+class FineTuneCallback(BaseCallback):
+    """Fine-tune a pre-trained snapshot from the first step of ``learn`` on: ``model.fine_tune()`` for configuration files.
+
+    A model that is fine-tuning already, because its run was cut off, goes on.
+
+    :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
+    :param keep_critic: for ablations
+    :param verbose: 1 prints what is fine-tuned
+    :raises ValueError: when ``learn`` begins, for a model that was not pre-trained
+    """
+
+    def __init__(self, keep_actor: bool | None = None, keep_critic: bool = False, verbose: int = 1):
+        super().__init__(verbose)
+        self.keep_actor = keep_actor
+        self.keep_critic = keep_critic
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_start(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.phase_timesteps == 0 and (model.phase == PRETRAINING or model.intrinsic_reward is None):
+            raise ValueError(
+                "FineTuneCallback needs a pre-trained model, this one has seen 0 frames: "
+                "load a snapshot with DreamerV2.load, or with rl_zoo3's -i."
+            )
+        if model.phase != PRETRAINING:
+            return
+        if self.verbose >= 1:
+            print(f"Fine-tuning what {model.phase_frames} frames of pre-training with {model.intrinsic_reward!r} left.")
+        model.fine_tune(keep_actor=self.keep_actor, keep_critic=self.keep_critic)
         model.restart_episodes()
 
 

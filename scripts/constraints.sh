@@ -19,7 +19,7 @@ pip=("$work/venv/bin/python" -m pip --disable-pip-version-check)
     echo "# a fresh virtual environment, 'pip install torch==$torch .[all]', 'pip freeze' without this package."
     echo "# torch carries no local tag (+cpu), so that the CPU and the CUDA builds both fit; a CUDA build brings its own"
     echo "# nvidia-* and triton packages, which are left out here. For Python 3.11 and 3.12 (numpy, labmaze)."
-    echo "# Use: pip install -c constraints.txt -e '.[dev,plots]'   (that is what 'make test' and 'make demo' do)"
+    echo "# Use: pip install -c constraints.txt -e '.[dev,plots,zoo]'   (that is what 'make test' and 'make demo' do)"
     "${pip[@]}" freeze --exclude-editable |
         grep -viE '^(nvidia-|cuda-|triton==|pip==|wheel==)' |
         sed -E 's/^(torch==[^+]*)\+.*/\1/'

@@ -79,7 +79,7 @@ install_packages() {
         say "no NVIDIA GPU is seen; should pip now fetch several GB of CUDA packages, stop it and give the same command with" \
             "TORCH_INDEX=https://download.pytorch.org/whl/cpu"
     fi
-    "${pip[@]}" install "${options[@]}" -c constraints.txt -e '.[dev,plots]'
+    "${pip[@]}" install "${options[@]}" -c constraints.txt -e '.[dev,plots,zoo]'
 }
 
 setup_python() {

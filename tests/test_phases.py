@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, PhaseSwitchCallback, SnapshotCallback
+from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
 from sb3_dreamer_urlb.phases import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT, TRANSFER, keeps_actor
 
 
@@ -289,7 +289,7 @@ def test_a_switch_is_found_again_by_repeated_learns_and_after_loading(tiny_model
     for _ in range(4):
         model.learn(16, callback=PhaseSwitchCallback(32))
         phases.append((model.phase, model.phase_timesteps))
-    assert phases == [("pretraining", 16), ("finetuning", 0), ("finetuning", 16), ("finetuning", 32)]
+    assert phases == [("pretraining", 16), ("pretraining", 32), ("finetuning", 16), ("finetuning", 32)]
     model = tiny_model(vec_env(), intrinsic_reward="lbs").learn(16)
     model.save(tmp_path / "half")
     model = DreamerV2.load(tmp_path / "half", env=vec_env(), device="cpu")
@@ -328,6 +328,54 @@ def test_an_environment_that_does_not_fit_is_refused(tiny_model, make_env, error
     with pytest.raises(error):
         model.learn(60, callback=PhaseSwitchCallback(20, make_env()))
     assert model.phase == "pretraining" and model.num_timesteps == 0
+
+
+def test_a_learn_that_ends_with_the_pre_training_keeps_it(tiny_model, tmp_path):
+    """What is saved is the pre-trained agent with its replay; the next learn begins with the switch."""
+    model = tiny_model(vec_env(), intrinsic_reward="lbs").learn(32, callback=PhaseSwitchCallback(32))
+    assert (model.phase, model.phase_frames, model.replay_buffer.phase) == ("pretraining", 32, "pretraining")
+    model.save(tmp_path / "end")
+    model = DreamerV2.load(tmp_path / "end", env=vec_env(), device="cpu")
+    recorder = Recorder()
+    model.learn(8, callback=[recorder, PhaseSwitchCallback(32)])
+    assert recorder.seen == [("finetuning", frames) for frames in range(1, 9)]
+
+
+# -- FineTuneCallback ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keep_actor", [None, False])
+def test_fine_tuning_by_callback_is_fine_tuning(tiny_model, weights, tmp_path, capsys, keep_actor):
+    """The same agent as after the call, and episodes that begin with a reset."""
+    tiny_model(vec_env(2), intrinsic_reward="lbs").learn(40).save(tmp_path / "pretrained")
+    agents = []
+    for by_callback in (False, True):
+        model = DreamerV2.load(tmp_path / "pretrained", env=vec_env(2), device="cpu")
+        callback = [Recorder(), FineTuneCallback(keep_actor)]
+        if not by_callback:
+            model.fine_tune(keep_actor=keep_actor)
+            callback.pop()
+        model.learn(8, callback=callback)
+        assert callback[0].seen == [("finetuning", frames) for frames in (2, 4, 6, 8)]
+        assert all(not episode.action[0].any() for episode in model.replay_buffer.open)
+        agents.append(parts(model, weights))
+    # Fresh heads are drawn from the global generator, which a load seeds.
+    assert agents[0] == agents[1]
+    assert "40 frames of pre-training with 'lbs'" in capsys.readouterr().out
+
+
+def test_fine_tuning_by_callback_goes_on_after_loading(tiny_model, tmp_path):
+    model = tiny_model(vec_env(), intrinsic_reward="lbs").learn(16)
+    model.learn(12, callback=FineTuneCallback(verbose=0)).save(tmp_path / "half")
+    model = DreamerV2.load(tmp_path / "half", env=vec_env(), device="cpu")
+    model.learn(8, callback=FineTuneCallback(verbose=0))
+    assert (model.phase, model.phase_timesteps) == ("finetuning", 20)
+
+
+@pytest.mark.parametrize("method", ["lbs", None])
+def test_fine_tuning_by_callback_needs_pre_training(tiny_model, method):
+    with pytest.raises(ValueError, match="pre-trained model, this one has seen 0 frames"):
+        tiny_model(vec_env(), intrinsic_reward=method).learn(8, callback=FineTuneCallback())
 
 
 # -- SnapshotCallback ------------------------------------------------------------------------------------------------------

@@ -1,0 +1,5 @@
+"""DreamerV2 inside rl_zoo3: ``python -m sb3_dreamer_urlb.zoo train|enjoy|record_video|plot ...``.
+
+``registration`` puts the algorithm into rl_zoo3's own dictionaries, ``sampler`` tells its ``-optimize`` what to try,
+``callbacks`` are for its YAML files. Importing this imports nothing heavy.
+"""

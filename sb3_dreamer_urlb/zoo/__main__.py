@@ -1,0 +1,87 @@
+"""``python -m sb3_dreamer_urlb.zoo train|enjoy|record_video|plot ...``: rl_zoo3's commands with ``--algo dreamerv2``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import runpy
+import sys
+from collections.abc import Sequence
+
+COMMANDS = {
+    "train": "train, go on from a snapshot (-i) or search for hyperparameters (-optimize)",
+    "enjoy": "play episodes with a trained model",
+    "record_video": "the same, into an .mp4",
+    "plot": "draw the learning curves of runs; --output FILE writes the picture",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Register DreamerV2 and hand over to rl_zoo3.
+
+    :param argv: arguments, those of the process if None
+    :return: exit status
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_dreamer_urlb.zoo",
+        description="rl_zoo3 with --algo dreamerv2.",
+        epilog="\n".join(f"{name:14}{text}" for name, text in COMMANDS.items())
+        + "\n\nAll else goes to rl_zoo3; '<command> --help' lists it.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("command", choices=COMMANDS)
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    command, rest = parser.parse_args(arguments[:1]).command, arguments[1:]
+
+    # As in the package's own command line: torch's threads wait asleep. Read when torch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    try:
+        # Heavy imports only now, so that --help answers at once.
+        import rl_zoo3
+
+        from sb3_dreamer_urlb.zoo.registration import register
+    except ModuleNotFoundError as error:
+        print(f"{parser.prog}: {error}; pip install 'sb3_dreamer_urlb[zoo]'", file=sys.stderr)
+        return 2
+    assert rl_zoo3.ALGOS
+    register()
+    if command == "plot":
+        _plot(rest)
+        return 0
+    if command == "enjoy" and not _has_display() and "--no-render" not in rest and "-h" not in rest:
+        print("No display: playing without a window (--no-render); record_video makes a film.")
+        rest = [*rest, "--no-render"]
+    sys.argv = [f"{parser.prog} {command}", *rest]
+    runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+    return 0
+
+
+def _has_display() -> bool:
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _plot(rest: list[str]) -> None:
+    """rl_zoo3's learning curves, also into a file, also with an environment's id as the other commands take it.
+
+    :param rest: rl_zoo3's arguments, and ``--output``
+    """
+    parser = argparse.ArgumentParser(prog="python -m sb3_dreamer_urlb.zoo plot", add_help=False)
+    parser.add_argument("--output")
+    own, rest = parser.parse_known_args(rest)
+    if own.output or not _has_display():
+        os.environ["MPLBACKEND"] = "Agg"
+    if not own.output and not _has_display() and not {"-h", "--help"} & set(rest):
+        parser.error("no display to show the curves on: write them into a file with --output")
+
+    from matplotlib import pyplot as plt
+    from rl_zoo3.plots import plot_train
+
+    # Folders of runs have a dash where the id has a slash.
+    sys.argv = [parser.prog, *(argument.replace("/", "-") if argument.startswith("urlb/") else argument for argument in rest)]
+    if own.output:
+        plt.show = lambda *args, **kwargs: plt.savefig(own.output)
+    plot_train()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""Callbacks for rl_zoo3's YAML files, which give keyword arguments and do not know the folder of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_dreamer_urlb.phases import SnapshotCallback
+
+
+class RunSnapshotCallback(SnapshotCallback):
+    """Snapshots of the pre-training in ``<folder of the run>/snapshots``.
+
+    A folder of their own, because rl_zoo3's ``-i`` loads a ``replay_buffer.pkl`` that lies beside a snapshot. A run
+    without a folder (``-optimize``) saves none.
+
+    :param frames: when, in environment frames of the pre-training
+    :param name_prefix: of the files
+    :param verbose: 1 prints each path
+    :raises ValueError: for numbers of frames that are not positive
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[int] = (100_000, 500_000, 1_000_000, 2_000_000),
+        name_prefix: str = "snapshot",
+        verbose: int = 1,
+    ):
+        super().__init__("", frames, name_prefix, verbose)
+
+    def _init_callback(self) -> None:
+        if self.save_path:
+            super()._init_callback()
+
+
+class FiniteWeightsCallback(BaseCallback):
+    """Stop a run whose weights have become NaN or infinite; rl_zoo3's ``-optimize`` prunes on the ValueError.
+
+    :raises ValueError: before the next rollout, naming the part of the agent
+    """
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        names, values = zip(*self.model.policy.named_parameters(), strict=True)
+        # One transfer from the device, not one a tensor; a sum is finite only where all of its terms are.
+        finite = th.stack([value.detach().sum() for value in values]).isfinite().tolist()
+        if not all(finite):
+            raise ValueError(
+                f"The weights {names[finite.index(False)]} are not finite after {self.model.num_timesteps} steps."
+            )

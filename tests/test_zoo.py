@@ -1,0 +1,333 @@
+"""rl_zoo3's commands with DreamerV2: the YAML files, and each command at tiny size."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import pytest
+import rl_zoo3.utils
+import torch as th
+import yaml
+from fake_envs import CounterEnv
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
+from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, env_id
+from sb3_dreamer_urlb.intrinsic import get_intrinsic_reward
+from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
+from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
+
+ROOT = Path(__file__).parent.parent
+CONFIGS = ROOT / "zoo_configs"
+METHODS = ("lbs", "plan2explore", "icm", "rnd", "apt", "diayn", "aps", "random")
+OTHERS = ("scratch", "finetune")
+FILES = [f"{folder}{name}.yml" for folder in ("", "small/") for name in (*METHODS, *OTHERS)]
+STAND, FLIP = "urlb/walker-stand-v0", "urlb/walker-flip-v0"
+
+
+def entries(file: str) -> dict[str, dict]:
+    """What rl_zoo3 reads from a configuration."""
+    return yaml.safe_load((CONFIGS / file).read_text())
+
+
+def leaves(value):
+    """All scalars inside nested lists and dictionaries."""
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from leaves(inner)
+    else:
+        yield value
+
+
+def is_known(method: str | None) -> bool:
+    try:
+        return method is None or bool(get_intrinsic_reward(method))
+    except ValueError:
+        return False
+
+
+# -- the files -------------------------------------------------------------------------------------------------------------
+
+
+def test_there_are_no_other_files():
+    assert sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*")) == sorted(FILES)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_file_has_all_twelve_tasks(file):
+    tasks = [env_id(domain, task) for domain, tasks in URLB_TASKS.items() for task in tasks]
+    assert sorted(entries(file)) == sorted(tasks) and set(tasks) <= set(gymnasium.registry)
+    # The comment in the files says that all tasks run alike.
+    [entry] = {yaml.dump(entry): entry for entry in copy.deepcopy(entries(file)).values()}.values()
+    for value in leaves(entry):
+        # YAML's 3e-4 is a string.
+        assert not (isinstance(value, str) and re.fullmatch(r"[-+\d.eE]+", value)), value
+    if Path(file).stem in METHODS:
+        assert entry["intrinsic_reward"] == Path(file).stem
+    assert entry.get("preset", "small" if "finetune" in file and "small/" in file else "paper") == (
+        "small" if file.startswith("small/") else "paper"
+    )
+
+
+@pytest.mark.parametrize("folder", ["", "small/"])
+def test_the_methods_files_differ_in_nothing_but_the_method(folder):
+    first = entries(f"{folder}lbs.yml")
+    for method in METHODS:
+        for entry in (other := entries(f"{folder}{method}.yml")).values():
+            entry["intrinsic_reward"] = "lbs"
+        assert other == first and list(other) == list(first)
+
+
+@pytest.mark.parametrize("folder", ["", "small/"])
+def test_frames_of_the_phases(folder):
+    """Fine-tuning, from-scratch runs and the second phase of a whole run are equally long; the paper's are the paper's."""
+    whole, scratch, finetune = (entries(f"{folder}{name}.yml")[STAND] for name in ("lbs", "scratch", "finetune"))
+    [snapshots, switch] = rl_zoo3.utils.get_callback_list(whole)
+    frames = 2 * whole["n_timesteps"]
+    assert frames - switch.pretrain_frames == 2 * scratch["n_timesteps"] == 2 * finetune["n_timesteps"]
+    assert snapshots.frames[-1] == switch.pretrain_frames
+    if not folder:
+        assert (switch.pretrain_frames, frames, len(snapshots.frames)) == (2_000_000, 2_100_000, 4)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_the_constructors_take_what_every_file_says(file, monkeypatch):
+    for preset in ("paper", "small"):
+        monkeypatch.setitem(PRESETS, preset, PRESETS["tiny"])
+    for entry in entries(file).values():
+        callbacks = rl_zoo3.utils.get_callback_list(entry)
+        arguments = {name: value for name, value in entry.items() if name not in ("callback", "n_timesteps")}
+        if is_known(arguments.get("intrinsic_reward")):
+            model = DreamerV2(env=CounterEnv(), device="cpu", **arguments)
+            assert model.phase == ("pretraining" if arguments.get("intrinsic_reward") else "finetuning")
+            assert len(callbacks) == {"scratch": 0, "finetune": 1}.get(Path(file).stem, 2)
+        else:
+            with pytest.raises(ValueError, match="Unknown intrinsic_reward"):
+                DreamerV2(env=CounterEnv(), device="cpu", **arguments)
+        with pytest.raises(TypeError, match="pretrain_frames"):
+            DreamerV2(env=CounterEnv(), device="cpu", pretrain_frames=3, **arguments)
+
+
+def test_the_page_names_what_exists():
+    page = (ROOT / "docs" / "zoo.md").read_text()
+    assert all(f"`{env_id(domain, task)}`" in page for domain, task in PRIMAL_TASK.items())
+    commands = re.findall(r"^python -m sb3_dreamer_urlb\.zoo (\w+) (-.*)$", page, re.MULTILINE)
+    assert {command for command, _ in commands} == set(COMMANDS)
+    for command, options in commands:
+        assert set(re.findall(r"urlb/\S+", options)) < set(gymnasium.registry)
+        assert [(ROOT / path).is_file() for path in re.findall(r"-conf (\S+)", options)] == [True] * (command == "train")
+    [own] = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]).values()
+    assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 2
+
+
+# -- the commands ----------------------------------------------------------------------------------------------------------
+
+#: a cheap walker under the ids of the benchmark; episodes are short enough to be learnt from at once
+CHEAP = {"length": 20, "action_repeat": 2, "domain": "walker"}
+CHEAP_WALKERS = f"""
+import gymnasium
+import sb3_dreamer_urlb
+for name in ({STAND!r}, {FLIP!r}):
+    gymnasium.registry[name].entry_point, gymnasium.registry[name].kwargs = "fake_envs:CounterEnv", {CHEAP!r}
+"""
+TINY = [
+    "preset:'tiny'",
+    "callback:[{'sb3_dreamer_urlb.zoo.callbacks.RunSnapshotCallback': dict(frames=[40, 80])},"
+    "{'sb3_dreamer_urlb.PhaseSwitchCallback': dict(pretrain_frames=80)}]",
+]
+TRAIN = ["train", "--algo", "dreamerv2", "--seed", "1", "--device", "cpu", "--verbose", "0"]
+
+
+@pytest.fixture
+def zoo(tmp_path, monkeypatch):
+    """Run a command of the zoo in an empty folder; in this process, which is faster."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["zoo"])
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for name in (STAND, FLIP):
+        monkeypatch.setitem(gymnasium.registry, name, EnvSpec(name, "fake_envs:CounterEnv", kwargs=CHEAP))
+
+    def run(*arguments: str) -> None:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*not of the same type.*")
+            assert main(arguments) == 0
+
+    return run
+
+
+def train(zoo, env: str = STAND, steps: int = 60, config: str = "lbs", *more: str, params: list[str] | None = None) -> Path:
+    """Train a tiny agent; gives the run's folder."""
+    options = ["--env", env, "-n", str(steps), "-conf", str(CONFIGS / f"{config}.yml"), "--eval-freq", "-1", *more]
+    zoo(*TRAIN, *options, *(["-params", *params] if params else []))
+    return latest_run(env)
+
+
+def latest_run(env: str, logs: Path = Path("logs")) -> Path:
+    return max((logs / "dreamerv2").glob(f"{env.replace('/', '-')}_*"), key=lambda path: int(path.name.split("_")[-1]))
+
+
+def model_in(folder: Path, env: str = STAND) -> DreamerV2:
+    return DreamerV2.load(folder / f"{env.replace('/', '-')}.zip", device="cpu")
+
+
+def in_a_process(arguments: list[str], folder: Path, tests: bool = True) -> str:
+    """Run Python with this checkout; gives what it printed."""
+    paths = [str(ROOT), *([str(ROOT / "tests")] if tests else [])]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_command_line_from_pre_training_to_a_film(tmp_path):
+    """As a user types it: three processes, in a folder that is not the repository's."""
+    (tmp_path / "custom_envs.py").write_text(CHEAP_WALKERS)
+    command = ["-m", "sb3_dreamer_urlb.zoo"]
+    common = ["--eval-freq", "-1", "-n"]
+    pretrain = [*TRAIN, "--env", STAND, "-conf", str(CONFIGS / "lbs.yml"), *common, "40", "-P", "-params", *TINY]
+    printed = in_a_process([*command, *pretrain], tmp_path)
+    assert "40/40" in printed
+    snapshot = "logs/dreamerv2/urlb-walker-stand-v0_1/snapshots/snapshot_80.zip"
+    finetune = [*TRAIN, "--env", FLIP, "-conf", str(CONFIGS / "finetune.yml"), "-i", snapshot, *common, "40"]
+    printed = in_a_process([*command, *finetune], tmp_path)
+    assert "Fine-tuning what 80 frames of pre-training with 'lbs' left." in printed
+    model = model_in(tmp_path / "logs/dreamerv2/urlb-walker-flip-v0_1", FLIP)
+    assert (model.phase, model.phase_timesteps, model.planner) == ("finetuning", 40, "dyna_mpc")
+    film = ["record_video", "--algo", "dreamerv2", "--env", FLIP, "-f", "logs", "-n", "5"]
+    in_a_process([*command, *film], tmp_path)
+    [path] = (tmp_path / "logs").rglob("*.mp4")
+    assert path.stat().st_size > 0
+
+
+def test_rl_zoo3_itself_in_the_repository(tmp_path):
+    """The literal command, on a real environment, without a configuration named."""
+    options = ["--env", STAND, "-n", "8", "--eval-freq", "-1", "-f", str(tmp_path), "-params", *TINY]
+    printed = in_a_process(["-m", "rl_zoo3.train", *TRAIN[1:], *options], ROOT, tests=False)
+    assert "zoo_configs/lbs.yml" in printed
+    model = model_in(latest_run(STAND, tmp_path))
+    assert (model.phase, model.phase_timesteps, model.observation_space.shape) == ("pretraining", 8, (3, 64, 64))
+
+
+def test_one_run_through_both_phases_with_all_savers(zoo, capsys):
+    savers = ["--eval-freq", "30", "--eval-episodes", "1", "--save-freq", "20", "--save-replay-buffer"]
+    run = train(zoo, STAND, 60, "lbs", *savers, params=TINY)
+    model = model_in(run)
+    assert (model.phase, model.phase_timesteps) == ("finetuning", 20)
+    assert {path.name for path in (run / "snapshots").iterdir()} == {"snapshot_40.zip", "snapshot_80.zip"}
+    saved = {path.name for path in run.iterdir()}
+    assert {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", "rl_model_20_steps.zip", "0.monitor.csv"} <= saved
+    model.load_replay_buffer(run / "replay_buffer.pkl")
+    assert model.replay_buffer.phase == "finetuning"
+
+    # It goes on, with its replay.
+    capsys.readouterr()
+    run = train(zoo, STAND, 8, "lbs", "-i", f"{run}/urlb-walker-stand-v0.zip", params=TINY)
+    assert "Loading replay buffer" in capsys.readouterr().out
+    assert (model_in(run).phase, model_in(run).phase_timesteps) == ("finetuning", 28)
+
+
+def test_a_pre_training_goes_on_and_ends_where_it_was_told(zoo):
+    run = train(zoo, STAND, 24, "lbs", "--save-replay-buffer", params=TINY)
+    assert model_in(run).phase_frames == 48
+    run = train(zoo, STAND, 16, "lbs", "-i", f"{run}/urlb-walker-stand-v0.zip", "--save-replay-buffer", params=TINY)
+    # The last step of the run was the last of the pre-training: what is saved is the pre-trained agent.
+    assert (model_in(run).phase, model_in(run).phase_frames) == ("pretraining", 80)
+    # Snapshots that were due before are not due again.
+    assert {path.name for path in (run / "snapshots").iterdir()} == {"snapshot_80.zip"}
+    run = train(zoo, STAND, 8, "lbs", "-i", f"{run}/urlb-walker-stand-v0.zip", params=TINY)
+    assert (model_in(run).phase, model_in(run).phase_frames) == ("finetuning", 16)
+
+
+def test_replay_of_another_phase_is_left_out(zoo):
+    run = train(zoo, STAND, 60, "lbs", "--save-freq", "20", "--save-replay-buffer", params=TINY)
+    early = f"{run}/rl_model_20_steps.zip"
+    with pytest.warns(UserWarning, match="a fine-tuning begins with an empty replay buffer"):
+        tuned = train(zoo, FLIP, 8, "finetune", "-i", early)
+    assert (model_in(tuned, FLIP).phase, model_in(tuned, FLIP).phase_timesteps) == ("finetuning", 8)
+    with pytest.warns(UserWarning, match=r"begins empty: .* filled in the phase 'finetuning', the model is in 'pretraining'"):
+        resumed = train(zoo, STAND, 8, "lbs", "-i", early, params=TINY)
+    assert (model_in(resumed).phase, model_in(resumed).phase_timesteps) == ("pretraining", 28)
+
+
+def test_mistakes_are_named(zoo, monkeypatch):
+    run = train(zoo, STAND, 8, "lbs", params=TINY)
+    with pytest.raises(ValueError, match=r"preset='tiny', the configuration says 'small'"):
+        train(zoo, STAND, 8, "small/lbs", "-i", f"{run}/urlb-walker-stand-v0.zip")
+    with pytest.raises(ValueError, match=r"intrinsic_reward='lbs', the configuration says None"):
+        train(zoo, STAND, 8, "scratch", "-i", f"{run}/urlb-walker-stand-v0.zip")
+    with pytest.raises(ValueError, match="FineTuneCallback needs a pre-trained model"):
+        train(zoo, FLIP, 8, "finetune", params=TINY[:1])
+    monkeypatch.setattr("sb3_dreamer_urlb.zoo.registration.DEFAULT_CONFIG", Path("nowhere.yml"))
+    with pytest.raises(ValueError, match="Name a configuration with -conf"):
+        zoo(*TRAIN, "--env", STAND)
+    with pytest.raises(SystemExit):
+        main(["dance"])
+
+
+def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rl_zoo3", None)
+    assert main(["train"]) == 2
+    assert "pip install 'sb3_dreamer_urlb[zoo]'" in capsys.readouterr().err
+
+
+def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
+    train(zoo, STAND, 45, "lbs", params=TINY)
+    zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "logs", "-n", "25", "--device", "cpu")
+    printed = capsys.readouterr().out
+    # Two of three rewards of the counting environment are 1 and 0.5.
+    assert "--no-render" in printed and "Mean reward: 10.0" in printed and "1 Episodes" in printed
+    from matplotlib import pyplot as plt
+
+    monkeypatch.setattr(plt, "show", plt.show)
+    plot = ["plot", "-a", "dreamerv2", "-e", STAND, "-f", "logs", "-w", "1"]
+    zoo(*plot, "--output", "curve.png")
+    assert Path("curve.png").read_bytes().startswith(b"\x89PNG")
+    assert [len(line.get_xdata()) for line in plt.gcf().axes[0].lines] == [2]  # episodes
+    plt.close("all")
+    with pytest.raises(SystemExit):
+        zoo(*plot)
+
+
+def test_optimize(zoo, monkeypatch):
+    seen = []
+    check = FiniteWeightsCallback._on_rollout_start
+    monkeypatch.setattr(FiniteWeightsCallback, "_on_rollout_start", lambda self: (seen.append(self.model), check(self)))
+    search = ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    study = ["--study-name", "walker", "--storage", "study.log"]
+    train(zoo, STAND, 30, "lbs", *search, *study, params=TINY)
+    [report] = Path("logs/dreamerv2").glob("report_*.csv")
+    header, *trials = report.read_text().splitlines()
+    assert len(trials) == 2 and all("COMPLETE" in trial for trial in trials)
+    assert "params_actor_learning_rate" in header
+    # Each trial has its own numbers, is checked for NaN, and leaves no snapshots.
+    assert len({id(model) for model in seen}) == 2 and not list(Path().rglob("snapshot_*"))
+    assert len({model.learning_rate for model in seen}) == 2
+    last = seen[-1]
+    model = model_in(train(zoo, STAND, 8, "lbs", *study, "--trial-id", "1", params=TINY))
+    assert (model.actor_learning_rate, model.batch_length) == (last.actor_learning_rate, last.batch_length)
+
+
+def test_weights_that_are_not_finite_end_a_run(tiny_model):
+    """ValueError is what -optimize prunes on."""
+    model = tiny_model().learn(8, callback=FiniteWeightsCallback())
+    next(model.policy.agent.critic.parameters()).data[0] = th.nan
+    with pytest.raises(ValueError, match=r"critic\S+ are not finite"):
+        model.learn(8, callback=FiniteWeightsCallback())
+
+
+def test_snapshots_need_a_run(tiny_model, tmp_path, monkeypatch):
+    """Without a folder none is saved, and certainly not into the working directory."""
+    monkeypatch.chdir(tmp_path)
+    callbacks = [RunSnapshotCallback(frames=[8]), PhaseSwitchCallback(8)]
+    tiny_model(intrinsic_reward="lbs").learn(16, callback=callbacks)
+    assert not list(tmp_path.iterdir())
