@@ -13,8 +13,8 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 PYTEST_WORKERS ?= 2
 BENCH_ARGS ?=
-# Golden files of the official implementation; they lie beside the checkout.
-GOLDEN ?= ../shared/golden/dreamer_finetune.npz ../shared/golden/lbs_pretrain.npz
+# Golden files of the official implementation.
+GOLDEN ?= tests/golden/*.npz
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -56,7 +56,7 @@ bench: setup-gl  ## time the update and the planner (BENCH_ARGS)
 	$(BIN)/python benchmarks/planner.py $(BENCH_ARGS)
 
 golden: setup  ## compare with the official implementation's numbers (GOLDEN: files)
-	@set -e; for file in $(GOLDEN); do $(BIN)/python tests/golden.py "$$file"; done
+	$(BIN)/python tests/golden.py $(GOLDEN)
 
 constraints:  ## make constraints.txt anew from setup.cfg's ranges
 	scripts/constraints.sh

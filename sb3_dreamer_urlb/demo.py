@@ -25,11 +25,11 @@ class DemoConfig:
     :param task: fine-tuning task, ``<domain>-<task>``; the pre-training never sees its reward
     :param pretrain_frames: environment frames of pre-training
     :param finetune_frames: environment frames of fine-tuning
-    :param keep_actor: fine-tune the pre-trained actor; None decides by the task, as the paper does
     :param episodes: evaluation episodes
     :param seed: of everything random
     :param preset: of the model
     :param fast_render: cheaper shadows
+    :param keep_actor: fine-tune the pre-trained actor; None decides by the task, as the paper does
     :raises ValueError: for a task that has no oracle score, or a number that is not positive
     """
 
@@ -37,13 +37,13 @@ class DemoConfig:
     task: str = "walker-stand"
     pretrain_frames: int = 3000
     finetune_frames: int = 12_000
-    # The paper keeps the actor for walker. After two thousand frames it has learnt little but to act narrowly: fine-tuning
-    # starts better with a fresh one (docs/results.md).
-    keep_actor: bool | None = False
     episodes: int = 3
     seed: int = 0
     preset: str = "small"
     fast_render: bool = True
+    # The paper keeps the actor for walker. After two thousand frames it has learnt little but to act narrowly: fine-tuning
+    # starts better with a fresh one (docs/results.md).
+    keep_actor: bool | None = False
 
     def __post_init__(self) -> None:
         if self.task not in ORACLE:

@@ -30,6 +30,8 @@ from sb3_dreamer_urlb.types import LatentState, SequenceBatch
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 RELATIVE, ABSOLUTE = 1e-4, 2e-5
+# A mean of both signs may come out near zero, and its rounding error does not shrink with it.
+SMALLEST_METRIC = 1e-3
 # The authors' name of each method, ours, and where its hyperparameters stand in the file's configuration.
 METHODS: dict[str, tuple[str | None, dict[str, str]]] = {
     "dreamer": (None, {}),
@@ -94,10 +96,10 @@ class Worst:
     def __init__(self) -> None:
         self.errors: defaultdict[str, float] = defaultdict(float)
 
-    def relative(self, group: str, ours: th.Tensor, theirs: np.ndarray) -> None:
-        """Largest difference in units of the largest magnitude of the reference."""
+    def relative(self, group: str, ours: th.Tensor, theirs: np.ndarray, least: float = 1e-8) -> None:
+        """Largest difference in units of the largest magnitude of the reference, or of ``least`` if that is larger."""
         difference = self._difference(ours, theirs)
-        self._note(group, difference / max(float(np.abs(theirs).max()), 1e-8))
+        self._note(group, difference / max(float(np.abs(theirs).max()), least))
 
     def absolute(self, group: str, ours: th.Tensor, theirs: np.ndarray) -> None:
         """Largest difference."""
@@ -153,8 +155,10 @@ class Case:
         )
         known = {**size, **self.config}
         kwargs = {ours: known[theirs] for ours, theirs in hyperparameters.items()}
-        intrinsic = None if self.config["fine_tune"] else make_intrinsic_reward(method, kwargs)
-        agent = Agent(world_model, net_arch, intrinsic)
+        intrinsic = make_intrinsic_reward(method, kwargs)
+        if self.config["fine_tune"] and intrinsic is not None and intrinsic.skills is None:
+            intrinsic = None
+        agent = Agent(world_model, net_arch, intrinsic, explores=not self.config["fine_tune"])
         agent.reward_normalizer.momentum = self.config["reward_norm"]["momentum"]
         return agent
 
@@ -190,6 +194,8 @@ class Case:
 
     def _load_weights(self) -> None:
         missing = {name for name, _ in self.agent.named_parameters()}
+        if self.config["fine_tune"]:
+            missing = {name for name in missing if not name.startswith("intrinsic.")}
         with th.no_grad():
             for name, value in self.named("init."):
                 parameter = self.parameter(name)
@@ -275,6 +281,7 @@ def check_updates(case: Case, worst: Worst) -> None:
             mock.patch.object(actor_critic, "behavior_metrics", spying_metrics),
             mock.patch.object(case.learner.reward_source, "replay_reward", spying_labels),
             mock.patch.object(Skills, "sample", lambda *_, skill=skill: skill),
+            mock.patch.object(Agent, "trains_behavior", lambda _: True),
         ):
             metrics = case.learner.update(case.batch(update))
         if f"update{update}.intrinsic_reward" in case.data:
@@ -284,7 +291,7 @@ def check_updates(case: Case, worst: Worst) -> None:
         for name, theirs in case.named(f"update{update}.metric."):
             name = INTRINSIC_METRIC.sub(r"intrinsic_\2", name.removeprefix(SKILL_PREFIX))
             if name not in unlogged:
-                worst.relative("losses", metrics[METRICS.get(name, name)], theirs)
+                worst.relative("losses", metrics[METRICS.get(name, name)], theirs, SMALLEST_METRIC)
     for name, theirs in case.named(f"update{last}.weights."):
         worst.absolute("weights", case.parameter(name), theirs)
 
