@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb demo``, or ``python -m sb3_dreamer_urlb demo``."""
+"""The command line: ``sb3-dreamer-urlb demo|convert``, or ``python -m sb3_dreamer_urlb demo|convert``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,21 +26,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     demo.add_argument("--finetune-frames", type=int)
     demo.add_argument("--episodes", type=int, help="evaluation episodes")
     demo.add_argument("--preset", help="of the model (default: small)")
+    old = commands.add_parser("convert", help="rewrite a model that Stable-Baselines3 saved with pickles in the safe form")
+    old.add_argument("old", type=Path)
+    old.add_argument("new", type=Path)
+    old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
-    options.pop("command")
+    command = options.pop("command")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Heavy imports only now, so that --help answers at once.
-    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
-
     try:
-        run_demo(DemoConfig(**options))
-    except (ValueError, ImportError) as error:
+        # Heavy imports only inside, so that --help answers at once.
+        (_demo if command == "demo" else _convert)(options)
+    except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _demo(options: dict[str, Any]) -> None:
+    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+
+    run_demo(DemoConfig(**options))
+
+
+def _convert(options: dict[str, Any]) -> None:
+    from sb3_dreamer_urlb.snapshots.convert import convert
+
+    model = convert(**options)
+    print(f"Wrote {options['new']}: {model.phase}, {model.phase_frames} frames.")
 
 
 if __name__ == "__main__":
