@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -16,13 +18,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dreamer_urlb import arguments, phases
+from sb3_dreamer_urlb import arguments, phases, run_folder
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.run_folder import RunFolder
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
@@ -181,6 +184,10 @@ class DreamerV2(OffPolicyAlgorithm):
         self.action_repeat = 1
         #: of the environment's task, None where it does not tell
         self.domain: str | None = None
+        #: where the run is kept, None unless a RunCheckpointCallback does
+        self.run_folder: RunFolder | None = None
+        #: what callbacks want undone when ``learn`` ends, however it ends
+        self.during_learn = ExitStack()
 
         if _init_setup_model:
             self._setup_model()
@@ -412,29 +419,30 @@ class DreamerV2(OffPolicyAlgorithm):
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
         """
-        total_timesteps, callbacks = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        callbacks.on_training_start(locals(), globals())
-        assert self.env is not None and isinstance(self.train_freq, TrainFreq)
-        while self.num_timesteps < total_timesteps:
-            rollout = self.collect_rollouts(
-                self.env,
-                callbacks,
-                self.train_freq,
-                self.replay_buffer,
-                self.action_noise,
-                self.learning_starts,
-                log_interval,
+        with self.during_learn:
+            total_timesteps, callbacks = self._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
             )
-            if not rollout.continue_training:
-                break
-            # SB3 gates on num_timesteps, which every learn() resets.
-            if self.phase_timesteps > self.learning_starts:
-                steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
-                self.train(steps, self.batch_size)
-        callbacks.on_training_end()
-        return self
+            callbacks.on_training_start(locals(), globals())
+            assert self.env is not None and isinstance(self.train_freq, TrainFreq)
+            while self.num_timesteps < total_timesteps:
+                rollout = self.collect_rollouts(
+                    self.env,
+                    callbacks,
+                    self.train_freq,
+                    self.replay_buffer,
+                    self.action_noise,
+                    self.learning_starts,
+                    log_interval,
+                )
+                if not rollout.continue_training:
+                    break
+                # SB3 gates on num_timesteps, which every learn() resets.
+                if self.phase_timesteps > self.learning_starts:
+                    steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
+                    self.train(steps, self.batch_size)
+            callbacks.on_training_end()
+            return self
 
     def _setup_learn(
         self,
@@ -532,6 +540,33 @@ class DreamerV2(OffPolicyAlgorithm):
         """
         arguments.check_load_keywords(cls, kwargs)
         return model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
+
+    @classmethod
+    def resume(
+        cls: type[SelfDreamerV2],
+        folder: str | os.PathLike[str],
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> SelfDreamerV2 | None:
+        """Go on with a run that a :class:`~sb3_dreamer_urlb.RunCheckpointCallback` kept, replay included.
+
+        Continue with ``learn(total - model.num_timesteps, reset_num_timesteps=False)``.
+
+        :param folder: of the run
+        :param env: environment to go on in
+        :param device: see :meth:`load`
+        :param custom_objects: see :meth:`load`
+        :param kwargs: see :meth:`load`
+        :return: the model as of the last checkpoint, random states included; None if there is none yet
+        :raises SnapshotError: naming the file and why it is refused
+        :raises RuntimeError: if the run is still going
+        """
+        arguments.check_load_keywords(cls, kwargs)
+        return run_folder.resume(
+            cls, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
+        )
 
     def set_parameters(  # type: ignore[override]
         self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"

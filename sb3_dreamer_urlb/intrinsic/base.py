@@ -88,3 +88,8 @@ def get_intrinsic_reward(name: str) -> type[IntrinsicReward]:
     if name not in _REGISTRY:
         raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(_REGISTRY)}, and None for the task's reward.")
     return _REGISTRY[name]
+
+
+def registered_intrinsic_rewards() -> dict[str, type[IntrinsicReward]]:
+    """All known methods by name."""
+    return dict(_REGISTRY)

@@ -21,7 +21,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -61,6 +61,14 @@ class Writer:
         self._zip = zipfile.ZipFile(file, "w", zipfile.ZIP_STORED)
         self._members: dict[str, dict[str, Any]] = {}
 
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # After a failure it would try again when it is collected, and complain.
+        with suppress(OSError, ValueError):
+            self._zip.close()
+
     def add(self, name: str, content: bytes) -> None:
         """Add a member."""
         self._members[name] = {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
@@ -91,10 +99,11 @@ def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
     """
     if isinstance(target, str | os.PathLike):
         path = path_to_write(target, suffix) if suffix else Path(target)
-        with written_atomically(path) as file:
-            yield Writer(file, kind)
+        with written_atomically(path) as file, Writer(file, kind) as writer:
+            yield writer
     elif hasattr(target, "write"):
-        yield Writer(target, kind)  # type: ignore[arg-type]
+        with Writer(target, kind) as writer:  # type: ignore[arg-type]
+            yield writer
     else:
         raise TypeError(f"Expected a path or a binary file object to save to, got {target!r}.")
 
@@ -140,13 +149,13 @@ class Archive:
             return file.read(count)
 
     def read(self, member: str) -> bytes:
-        """A whole member, compared with its sha256.
+        """A whole member.
 
-        :raises ValueError: if it differs
+        :raises ValueError: if its sha256 differs from the manifest's
         """
         content = self._zip.read(member)
-        if hashlib.sha256(content).hexdigest() != self._members[member]["sha256"]:
-            raise ValueError(f"the sha256 of {member} differs from the manifest's")
+        if ROWS.fullmatch(member):
+            self._compare_sha256(member, hashlib.sha256(content))
         return content
 
     def _text(self, member: str) -> str:
@@ -157,6 +166,9 @@ class Archive:
         with self._zip.open(member) as file:
             while block := file.read(BLOCK):
                 digest.update(block)
+        self._compare_sha256(member, digest)
+
+    def _compare_sha256(self, member: str, digest: Any) -> None:
         if digest.hexdigest() != self._members[member]["sha256"]:
             raise ValueError(f"the sha256 of {member} differs from the manifest's")
 

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward, base, get_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 
 TAG = "!"
@@ -112,14 +112,15 @@ def contains_custom(value: Any) -> Custom | None:
 def _encode_intrinsic(value: Any) -> Any:
     """A registered class, or an instance that knows its keyword arguments, by the name it is registered under."""
     method = value if isinstance(value, type) else type(value)
-    names = [name for name, known in base._REGISTRY.items() if known is method]
+    names = [name for name, known in registered_intrinsic_rewards().items() if known is method]
     if not issubclass(method, IntrinsicReward) or not names:
         raise Unstorable(f"A {method.__module__}.{method.__qualname__} cannot be stored")
     if isinstance(value, type):
         return {TAG: "intrinsic", "name": names[0]}
-    if not isinstance(getattr(value, "kwargs", None), dict):
+    kwargs = getattr(value, "constructor_kwargs", None)
+    if not isinstance(kwargs, dict):
         raise Unstorable(f"The {names[0]!r} does not tell its keyword arguments")
-    return {TAG: "intrinsic", "name": names[0], "kwargs": encode(value.kwargs)}
+    return {TAG: "intrinsic", "name": names[0], "kwargs": encode(kwargs)}
 
 
 def _intrinsic(name: str, kwargs: dict[str, Any] | None = None) -> Any:
