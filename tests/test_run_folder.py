@@ -191,7 +191,7 @@ def test_the_same_model_may_learn_again(tiny_model, tmp_path):
 def test_another_run_in_the_folder_is_refused(tiny_model, tmp_path):
     tiny_model(vec_env()).learn(40, callback=RunCheckpointCallback(tmp_path))
     before = (tmp_path / "snapshot.zip").read_bytes()
-    with pytest.raises(ValueError, match="holds another run.*resume"):
+    with pytest.raises(ValueError, match=r"holds another run.*resume"):
         tiny_model(vec_env()).learn(40, callback=RunCheckpointCallback(tmp_path))
     assert (tmp_path / "snapshot.zip").read_bytes() == before
 
@@ -206,7 +206,9 @@ def test_two_writers(tiny_model, tmp_path):
         DreamerV2.resume(tmp_path, vec_env())
     # An error in learn gives the folder back, and the signals.
     with pytest.raises(ZeroDivisionError):
-        model.learn(20, callback=[RunCheckpointCallback(tmp_path), ConvertCallback(lambda *_: 1 / 0)], reset_num_timesteps=False)
+        model.learn(
+            20, callback=[RunCheckpointCallback(tmp_path), ConvertCallback(lambda *_: 1 / 0)], reset_num_timesteps=False
+        )
     with RunFolder(tmp_path).locked():
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 

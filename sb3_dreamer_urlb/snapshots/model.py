@@ -180,7 +180,7 @@ def _blank(
     unknown = sorted(set(arguments) - set(known))
     if unknown:
         raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
-    given = {**{name: value for name, value in custom.items() if name in known}, **kwargs}
+    given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
     decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
     for name, value in decoded.items():
         if (missing := values.contains_custom(value)) is not None:
