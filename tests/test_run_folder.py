@@ -332,16 +332,58 @@ def test_sigint_raises_keyboard_interrupt(tiny_model, tmp_path):
     assert DreamerV2.resume(tmp_path, vec_env()).num_timesteps in (50, 51)
 
 
-def test_a_full_disk_leaves_the_last_checkpoint(tiny_model, tmp_path):
-    model = tiny_model(vec_env()).learn(60, callback=RunCheckpointCallback(tmp_path))
-    expected = {name: value for name, value in everything(model).items() if name in ("weights", "moments", "counters")}
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+class SmallDisk:
+    """A disk of 1 MB, mounted."""
+
+    def __init__(self, folder):
+        self.folder = folder / "disk"
+        self.folder.mkdir()
+        mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(self.folder)]
+        if subprocess.run(mount, capture_output=True).returncode != 0:
+            pytest.skip("only root can mount a small disk")
+
+    def fill(self):
+        free = os.statvfs(self.folder)
+        (self.folder / "filler").write_bytes(b"x" * (free.f_bavail * free.f_bsize - 40_000))
+
+    def free(self):
+        (self.folder / "filler").unlink(missing_ok=True)
+
+    def close(self):
+        subprocess.run(["umount", str(self.folder)], check=True)
+
+
+class SmallFiles:
+    """A limit of the process on the size of its files."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, self.before[1]))
+
+    def free(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
+
+    close = free
+
+
+@pytest.mark.parametrize(("make", "reason"), [(SmallDisk, "No space left"), (SmallFiles, "File too large")])
+def test_a_full_disk_leaves_the_last_checkpoint(tiny_model, tmp_path, make, reason):
+    disk = make(tmp_path)
+    run = disk.folder / "run"
     try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(OSError, match=r"intact.*000002|intact.*snapshot\.zip"):
-            model.learn(60, callback=RunCheckpointCallback(tmp_path, 20), reset_num_timesteps=False)
+        model = tiny_model(vec_env()).learn(60, callback=RunCheckpointCallback(run))
+        expected = {name: value for name, value in everything(model).items() if name in ("weights", "moments", "counters")}
+        disk.fill()
+        with pytest.raises(OSError, match=rf"{reason}.*intact.*{run}"):
+            model.learn(60, callback=RunCheckpointCallback(run, 20), reset_num_timesteps=False)
+        assert not list(run.rglob("*.tmp"))
+        resumed = DreamerV2.resume(run, vec_env(), device="cpu")
+        assert {name: everything(resumed)[name] for name in expected} == expected
+        disk.free()
+        resumed.learn(60, callback=RunCheckpointCallback(run, 20), reset_num_timesteps=False)
+        assert DreamerV2.resume(run, vec_env()).num_timesteps == 120
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    resumed = DreamerV2.resume(tmp_path, vec_env(), device="cpu")
-    assert {name: everything(resumed)[name] for name in expected} == expected
-    assert not list(tmp_path.rglob("*.tmp"))
+        disk.close()
