@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +170,16 @@ def test_print_system_info(saved, tmp_path, capsys):
     load(path, print_system_info=True)
     out = capsys.readouterr().out
     assert "OS: [31mred" in out and "\x1b" not in out and "PyTorch" in out
+
+
+def test_statistics_of_episodes(tiny_model, tmp_path):
+    """At most the last thousand, so that a file stays one that can be read."""
+    model = tiny_model(CounterEnv(2), stats_window_size=100_000)
+    model.ep_info_buffer = deque([{"r": float(i), "l": 2, "t": 0.5} for i in range(70_000)], maxlen=100_000)
+    model.save(tmp_path / "m")
+    loaded = load(tmp_path / "m")
+    assert [info["r"] for info in loaded.ep_info_buffer] == list(range(69_000, 70_000))
+    assert loaded.ep_info_buffer.maxlen == 100_000
 
 
 # -- arguments -------------------------------------------------------------------------------------------------------------
@@ -396,7 +407,8 @@ DATA = {
     "intrinsic": (_argument("intrinsic_reward", {"!": "intrinsic", "name": "os"}), "Unknown intrinsic_reward"),
     "huge network": (_sizes(deter_size=10**12), ""),
     "large network": (_sizes(hidden_size=50_000, deter_size=50_000), "model's"),
-    "deep network": (_sizes(net_arch=[8] * 1000), "lacks"),
+    "deep network": (_sizes(net_arch=[8] * 30), "lacks"),
+    "deepest network": (_sizes(net_arch=[8] * 100_000), "more than .* parameters"),
     "policy kwargs": (_argument("policy_kwargs", [1]), "policy_kwargs"),
     "policy": (_field("policy", "os.system"), "Unknown policy"),
     "negative": (_argument("batch_size", -1), "batch_size"),

@@ -41,6 +41,8 @@ FIELDS = {
     "progress_remaining", "random", "episodes", "run",
 }  # fmt: skip
 MAX_ENVS = 65_536
+#: whose statistics are kept
+MAX_EPISODES = 1000
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -97,7 +99,7 @@ def _data(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
         "random": capture(model),
         "episodes": [
             {key: float(info[key]) for key in ("r", "l", "t")}
-            for info in model.ep_info_buffer or ()
+            for info in list(model.ep_info_buffer or ())[-MAX_EPISODES:]
             if all(is_finite_number(info.get(key)) for key in ("r", "l", "t"))
         ],
         "run": run,
@@ -240,8 +242,7 @@ def _attach(model: DreamerV2, env: GymEnv | str) -> None:
 def _build_checked(model: DreamerV2, archive: Archive) -> None:
     """Build the networks only after the file's tensors turned out to be of just their sizes."""
     found = tensors.read_table(archive, TENSORS)
-    with th.device("meta"):
-        expected = tensors.table_of(_named(model._new_policy()))
+    expected = {f"policy.{name}": entry for name, entry in tensors.table_without_memory(model._new_policy, found).items()}
     tensors.compare({name: entry for name, entry in found.items() if name.startswith("policy.")}, expected)
     model.set_random_seed(model.seed)
     model._build()

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import safetensors.torch
 import torch as th
+from torch import nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_dreamer_urlb.snapshots import bounded_json
 from sb3_dreamer_urlb.snapshots.archive import Archive
@@ -24,6 +27,29 @@ MAX_HEADER = 4 << 20
 def table_of(tensors: dict[str, th.Tensor]) -> Table:
     """Name → dtype and shape, as safetensors calls them; also of tensors without memory (``device="meta"``)."""
     return {name: (DTYPES[tensor.dtype], tuple(tensor.shape)) for name, tensor in tensors.items()}
+
+
+def table_without_memory(build: Callable[[], nn.Module], found: Table) -> Table:
+    """The table of a module that is built without memory.
+
+    :param build: makes it
+    :param found: of the file that describes it
+    :raises ValueError: if it gets far more parameters than the file has; a million layers take time even without memory
+    """
+    most, count = 1000 + 4 * len(found), 0
+
+    def check(*_: object) -> None:
+        nonlocal count
+        count += 1
+        if count > most:
+            raise ValueError(f"it describes more than {most} parameters and has {len(found)} tensors")
+
+    hook = register_module_parameter_registration_hook(check)
+    try:
+        with th.device("meta"):
+            return table_of(build().state_dict())
+    finally:
+        hook.remove()
 
 
 def pack(tensors: dict[str, th.Tensor]) -> bytes:
