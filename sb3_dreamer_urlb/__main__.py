@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb demo|methods``, or ``python -m sb3_dreamer_urlb demo|methods``."""
+"""The command line: ``sb3-dreamer-urlb demo|methods|convert``, or ``python -m sb3_dreamer_urlb demo|methods|convert``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,26 +36,43 @@ def main(argv: Sequence[str] | None = None) -> int:
     tour.add_argument("--episodes", type=int, help="evaluation episodes")
     tour.add_argument("--preset", help="of the model (default: small)")
     tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
+    old = commands.add_parser("convert", help="rewrite a model that Stable-Baselines3 saved with pickles in the safe form")
+    old.add_argument("old", type=Path)
+    old.add_argument("new", type=Path)
+    old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
     command = options.pop("command")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Heavy imports only now, so that --help answers at once.
     try:
-        if command == "demo":
-            from sb3_dreamer_urlb.demo import DemoConfig, run_demo
-
-            run_demo(DemoConfig(**options))
-        else:
-            from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
-
-            visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
-            return int(any(visit.faults() for visit in visits))
-    except (ValueError, ImportError) as error:
+        # Heavy imports only inside, so that --help answers at once.
+        return {"demo": _demo, "methods": _methods, "convert": _convert}[command](options)
+    except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2
+
+
+def _demo(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+
+    run_demo(DemoConfig(**options))
+    return 0
+
+
+def _methods(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
+
+    visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
+    return int(any(visit.faults() for visit in visits))
+
+
+def _convert(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.snapshots.convert import convert
+
+    model = convert(**options)
+    print(f"Wrote {options['new']}: {model.phase}, {model.phase_frames} frames.")
     return 0
 
 
