@@ -147,23 +147,6 @@ def check_env(model: DreamerV2, env: VecEnv) -> None:
     _check_episode_fits(env, model.batch_length)
 
 
-def check_replay_buffer(model: DreamerV2, buffer: Any) -> None:
-    """Whether a loaded replay buffer belongs to a model like this.
-
-    :raises ValueError: naming what differs
-    """
-    if not isinstance(buffer, SequenceReplayBuffer):
-        raise ValueError(f"The file holds no SequenceReplayBuffer but {type(buffer).__name__}.")
-    if buffer.phase != model.phase:
-        raise ValueError(f"The replay buffer was filled in the phase {buffer.phase!r}, the model is in {model.phase!r}.")
-    for name in ("n_envs", "batch_length", "skill_size"):
-        if getattr(buffer, name) != getattr(model, name):
-            raise ValueError(f"The replay buffer has {name}={getattr(buffer, name)}, the model {getattr(model, name)}.")
-    for name in ("observation_space", "action_space"):
-        if getattr(buffer, name) != getattr(model, name):
-            raise ValueError(f"The replay buffer's {name} is {getattr(buffer, name)}, the model's {getattr(model, name)}.")
-
-
 def _check_episode_fits(env: VecEnv, batch_length: int) -> None:
     steps = env_attribute(env, "max_episode_steps", None)
     if steps is None:

@@ -125,6 +125,11 @@ class PhaseSwitchCallback(BaseCallback):
         # Now, not after the 2M frames of pre-training.
         model: DreamerV2 = self.model  # type: ignore[assignment]
         self.env = model.prepare_env(self.env)
+        resumed = model.run_folder is not None and model.run_folder.resumed
+        if resumed and model.phase != PRETRAINING and model.get_env() is not self.env:
+            # The run was resumed after the switch, with the pre-training's environment.
+            model.set_env(self.env)
+            model.restart_episodes()
 
     def _on_step(self) -> bool:
         return True

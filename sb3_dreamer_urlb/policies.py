@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -17,12 +17,16 @@ from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import DynaMPC
+from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
+from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 IMAGE_SIZES = (16, 512)
 # Deterministic predictions draw their posterior states and planning noise from this seed, always the same.
 DETERMINISTIC_SEED = 0
+
+SelfDreamerPolicy = TypeVar("SelfDreamerPolicy", bound="DreamerPolicy")
 
 
 @dataclasses.dataclass
@@ -124,6 +128,31 @@ class DreamerPolicy(BasePolicy):
         )
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
+
+    # -- saving --------------------------------------------------------------------------------------------------------
+
+    def save(self, path: Target) -> None:  # type: ignore[override]
+        """Write the policy, in a form that can never run code.
+
+        :param path: path, taken as it is, or binary file object
+        """
+        policy_snapshot.save(self, path)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfDreamerPolicy],
+        path: Target,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+    ) -> SelfDreamerPolicy:
+        """Read what :meth:`save` wrote.
+
+        :param path: path or binary file object
+        :param device: where to put it
+        :param custom_objects: constructor arguments that no file can hold, as an intrinsic reward that is not registered
+        :raises SnapshotError: naming the file and why it is refused
+        """
+        return policy_snapshot.load(cls, path, device, custom_objects)
 
     # -- acting --------------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ stream, so episodes may end at different times; only finished episodes are drawn
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -26,6 +26,9 @@ class Episode:
     :param skill: under which the first action is chosen, (W,)
     """
 
+    COLUMNS: ClassVar[tuple[str, ...]] = ("observation", "action", "reward", "is_terminal", "skill")
+    length: int
+
     def __init__(self, observation: np.ndarray, action_size: int, skill: np.ndarray):
         capacity = 128
         self.observation = np.empty((capacity, *observation.shape), observation.dtype)
@@ -36,6 +39,16 @@ class Episode:
         self.length = 1
         self.observation[0] = observation
         self.skill[0] = skill
+
+    @classmethod
+    def of(cls, columns: dict[str, np.ndarray]) -> Episode:
+        """A finished episode of given rows, for example from a file.
+
+        :param columns: rows of each of ``COLUMNS``
+        """
+        episode = cls.__new__(cls)
+        episode.__dict__.update(columns, length=len(columns["reward"]))
+        return episode
 
     def __len__(self) -> int:
         return self.length
@@ -58,7 +71,7 @@ class Episode:
         return self
 
     def _resize(self, capacity: int) -> None:
-        for name in ("observation", "action", "reward", "is_terminal", "skill"):
+        for name in self.COLUMNS:
             old = getattr(self, name)
             new = np.empty((capacity, *old.shape[1:]), old.dtype)
             new[: self.length] = old[: self.length]
@@ -119,6 +132,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.finished_rows = 0
         self.finished_count = 0
         self.longest = 0
+        #: episodes that went; episode i of those held is number ``evicted + i`` of all
+        self.evicted = 0
 
     def size(self) -> int:
         """Rows held, those of open episodes included."""
@@ -174,8 +189,20 @@ class SequenceReplayBuffer(ReplayBuffer):
             return
         self.episodes.append(episode.finish())
         self.finished_rows += len(episode)
+        self.evict()
+
+    def evict(self) -> None:
+        """Let the oldest episodes go until ``buffer_size`` is kept."""
         while self.finished_rows > self.buffer_size and len(self.episodes) > 1:
             self.finished_rows -= len(self.episodes.popleft())
+            self.evicted += 1
+
+    def columns(self) -> dict[str, tuple[th.dtype, tuple[int, ...]]]:
+        """What a row of an episode consists of: name → type and shape, for files."""
+        first = np.zeros(self.obs_shape, self.observation_space.dtype)
+        episode = Episode(first, self.action_dim, np.zeros(self.skill_size, np.float32))
+        rows = {name: getattr(episode, name) for name in Episode.COLUMNS}
+        return {name: (th.from_numpy(array[:0]).dtype, array.shape[1:]) for name, array in rows.items()}
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
