@@ -15,6 +15,7 @@ from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_numb
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import check_image_space
+from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "explores",
     "planner",
     "planning",
+    "precision",
 }
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
@@ -94,6 +96,8 @@ def check(model: DreamerV2) -> None:
 
 
 def _check_names(model: DreamerV2) -> None:
+    if model.precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:
