@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
+import subprocess
+import sys
 
 import pytest
 import torch as th
@@ -75,6 +78,13 @@ def test_products_are_short_all_else_is_float32(learner, batch, intrinsic, monke
     tensors = [posterior.state.stoch, posterior.state.deter, posterior.embed, posterior.post_logits, posterior.prior_logits]
     tensors += [posterior.kl, imagination.feature, imagination.action, imagination.entropy]
     assert all(tensor.dtype == th.float32 for tensor in tensors)
+
+
+@pytest.mark.parametrize("intrinsic", ["diayn", "aps"])
+def test_methods_with_skills_learn_in_short_products(tiny_model, intrinsic):
+    model = tiny_model(intrinsic_reward=intrinsic, precision="bfloat16").learn(40)
+    assert model.phase_updates > 0
+    assert all(value.dtype == th.float32 and value.isfinite() for value in model._metrics.sums.values())
 
 
 def test_both_learn_the_same(learner, batch):
@@ -152,6 +162,36 @@ def test_memory_is_kept_unless_the_user_says_no(unset, monkeypatch, tiny_model):
     monkeypatch.delenv(memory.SWITCH)
     tiny_model()
     assert memory.keep_freed_memory.cache_info().misses == 1  # the learner has asked
+
+
+def test_freed_memory_costs_no_page_faults(unset):
+    """In a process of its own: the setting cannot be taken back."""
+    code = """
+import resource, torch
+from sb3_dreamer_urlb import memory
+kept = memory.keep_freed_memory()
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(2**24)  # 64 MB, 16384 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(kept, faults())
+"""
+
+    def run(switch):
+        environment = {**os.environ, memory.SWITCH: switch}
+        output = subprocess.run(
+            [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
+        ).stdout
+        kept, faults = output.split()
+        return kept == "True", int(faults)
+
+    kept, faults = run("1")
+    if not kept:
+        pytest.skip("not glibc")
+    assert faults < 100
+    kept, faults = run("0")
+    assert not kept and faults > 100
 
 
 def test_another_c_library_is_left_alone(unset, monkeypatch):
