@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     tour.add_argument("--methods", nargs="+", help="which (default: all)")
     tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
     for run in (demo, tour):
-        run.add_argument("--task", help="fine-tuning task, for example walker-walk (default: walker-stand)")
+        run.add_argument("--task", help="for example walker-walk (default: walker-stand)")
         run.add_argument("--seed", type=int)
         run.add_argument("--pretrain-frames", type=int)
         run.add_argument("--finetune-frames", type=int)

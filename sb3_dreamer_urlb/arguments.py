@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -15,6 +16,7 @@ from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_numb
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import check_image_space
+from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 if TYPE_CHECKING:
@@ -53,6 +55,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "explores",
     "planner",
     "planning",
+    "precision",
 }
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
@@ -86,6 +89,10 @@ def check(model: DreamerV2) -> None:
         value = getattr(model, name)
         if not callable(value) and not (is_finite_number(value) and value >= 0):
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+    if model.discount_head is not None and not isinstance(model.discount_head, bool):
+        raise ValueError(f"discount_head must be True, False or None, got {model.discount_head!r}.")
+    if model.action_noise is not None and not isinstance(model.action_noise, ActionNoise):
+        raise ValueError(f"action_noise must be an ActionNoise of Stable-Baselines3 or None, got {model.action_noise!r}.")
     _check_names(model)
     _check_policy_kwargs(model)
     _check_spaces(model)
@@ -94,6 +101,8 @@ def check(model: DreamerV2) -> None:
 
 
 def _check_names(model: DreamerV2) -> None:
+    if model.precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:

@@ -85,6 +85,8 @@ class DreamerV2(OffPolicyAlgorithm):
     :param verbose: 0 quiet, 1 info, 2 debug
     :param seed: of everything random
     :param device: "auto", "cpu", "cuda"
+    :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
+        faster on this machine at this size; losses, statistics and weights are float32 in any case
     :param preset: ``"paper"``, ``"small"`` (two CPU cores) or ``"tiny"`` (tests); replaces defaults, never what you write
     :param _init_setup_model: build the networks now
     :raises ValueError: for arguments or spaces that do not fit, before anything is built
@@ -136,6 +138,7 @@ class DreamerV2(OffPolicyAlgorithm):
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
+        precision: str = "auto",
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -180,6 +183,7 @@ class DreamerV2(OffPolicyAlgorithm):
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
         self.discount_head = discount_head
+        self.precision = precision
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -234,6 +238,8 @@ class DreamerV2(OffPolicyAlgorithm):
         self.policy = self._new_policy().to(self.device)
         self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
         self.learner.updates = self.phase_updates
+        if self.verbose >= 1:
+            print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
@@ -247,6 +253,7 @@ class DreamerV2(OffPolicyAlgorithm):
             intrinsic=self._intrinsic(),
             explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda),
+            precision=self.precision,
             **self.policy_kwargs,
         )
 
@@ -272,6 +279,7 @@ class DreamerV2(OffPolicyAlgorithm):
             target_update_interval=self.target_update_interval,
             ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
             reward_trains_model=not phases.PHASES[self.phase].explores,
+            precision=self.precision,
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
@@ -331,7 +339,7 @@ class DreamerV2(OffPolicyAlgorithm):
         skills = self.policy.agent.skills
         if skills is None:
             raise ValueError(f"intrinsic_reward={self.intrinsic_reward!r} has no skills.")
-        skills.fix(skills.numbered(int(skill)) if isinstance(skill, (int, np.integer)) else skill)
+        skills.fix(skills.numbered(int(skill)) if isinstance(skill, int | np.integer) else skill)
 
     def _choose_skill(self) -> None:
         """Choose the skill that serves the task best (spec/algorithms §6)."""

@@ -19,7 +19,9 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
+from sb3_dreamer_urlb.evaluation.scores import ORACLE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward, registered_intrinsic_rewards
+from sb3_dreamer_urlb.presets import get_preset
 
 COLUMNS = ("method", "updates", "intrinsic reward", "spread", "module's loss", "fine-tuned", "minutes", "")
 
@@ -38,7 +40,7 @@ class TourConfig:
     :param preset: of the model
     :param jobs: methods at a time, one thread each
     :param log_every: agent steps between two records
-    :raises ValueError: for an unknown method, or a number that is not positive
+    :raises ValueError: for an unknown method, task or preset, or a number that is not positive
     """
 
     out: Path = Path("methods_output")
@@ -53,6 +55,9 @@ class TourConfig:
     log_every: int = 100
 
     def __post_init__(self) -> None:
+        if self.task not in ORACLE:
+            raise ValueError(f"Unknown task {self.task!r}; known are {sorted(ORACLE)}.")
+        get_preset(self.preset)
         known = registered_intrinsic_rewards()
         unknown = sorted(set(self.methods) - set(known))
         if unknown:

@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_dreamer_urlb import precision as precisions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
@@ -70,6 +71,7 @@ class DreamerPolicy(BasePolicy):
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
+    :param precision: of the planner's products, see :class:`~sb3_dreamer_urlb.DreamerV2`; all else here is float32
     :param normalize_images: part of SB3's interface; uint8 images are always scaled to [-0.5, 0.5]
     :raises ValueError: for spaces or sizes that do not fit
     """
@@ -91,9 +93,12 @@ class DreamerPolicy(BasePolicy):
         explores: bool = True,
         planner: DynaMPC | None = None,
         planning: bool = True,
+        precision: str = "float32",
         normalize_images: bool = True,
     ):
         super().__init__(observation_space, action_space, normalize_images=normalize_images)
+        if net_arch is not None and not isinstance(net_arch, Sequence):
+            raise ValueError(f"policy_kwargs: net_arch must be a sequence of widths, got {net_arch!r}.")
         net_arch = [400] * 4 if net_arch is None else list(net_arch)
         sizes = {
             "deter_size": deter_size,
@@ -119,6 +124,7 @@ class DreamerPolicy(BasePolicy):
         self.intrinsic = intrinsic
         self.planner = planner
         self.planning = planning
+        self.precision = precision
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -126,8 +132,14 @@ class DreamerPolicy(BasePolicy):
         parameters.update(
             self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner, planning=self.planning
         )
+        parameters.update(precision=self.precision)
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
+
+    @property
+    def planner_dtype(self) -> th.dtype:
+        """Format of the planner's products."""
+        return precisions.choose(self.precision, "planner", self.device, self.agent.world_model.sizes.feature)
 
     # -- saving --------------------------------------------------------------------------------------------------------
 
@@ -213,7 +225,8 @@ class DreamerPolicy(BasePolicy):
             action = 2 * th.rand(state.action.shape, generator=generator, device=self.device) - 1
         elif self.planner is not None and self.planning:
             planned = PlannedAgent(self.agent, skill)
-            action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
+            with precisions.products(self.device, self.planner_dtype):
+                action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mean if deterministic else policy.sample(generator)

@@ -188,7 +188,12 @@ def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **k
     :param env: environment to go on in
     :param kwargs: of :func:`sb3_dreamer_urlb.snapshots.model.load`
     :return: the model with its replay; None if there is no checkpoint yet
+    :raises NotADirectoryError: for a file
     """
+    if os.path.isfile(folder):
+        raise NotADirectoryError(
+            f"resume() takes the folder of a run, got the file {os.fspath(folder)!r}: DreamerV2.load reads it."
+        )
     run_folder = RunFolder(folder)
     if not run_folder.snapshot.exists():
         return None

@@ -49,6 +49,8 @@ def test_faults_are_found():
 def test_bad_input(capsys):
     with pytest.raises(ValueError, match=r"Unknown methods \['lbz'\]; known are .*'lbs'"):
         TourConfig(methods=("lbz",))
+    with pytest.raises(ValueError, match=r"Unknown task 'walker-jump'; known are .*walker-run"):
+        TourConfig(task="walker-jump")
     with pytest.raises(ValueError, match="jobs must be positive, got 0"):
         TourConfig(jobs=0)
     assert main(["methods", "--methods", "lbz"]) == 2 and "Unknown methods" in capsys.readouterr().err

@@ -387,3 +387,9 @@ def test_a_full_disk_leaves_the_last_checkpoint(tiny_model, tmp_path, make, reas
         assert DreamerV2.resume(run, vec_env()).num_timesteps == 120
     finally:
         disk.close()
+
+
+def test_resume_wants_a_folder(tmp_path):
+    (tmp_path / "model.zip").touch()
+    with pytest.raises(NotADirectoryError, match=r"got the file .*model\.zip"):
+        DreamerV2.resume(tmp_path / "model.zip")

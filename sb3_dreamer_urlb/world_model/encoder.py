@@ -8,6 +8,9 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.world_model.convolution import convolve
+
 KERNEL, STRIDE = 4, 2
 
 
@@ -40,5 +43,6 @@ class ConvEncoder(nn.Module):
         # Channels last is a third faster on CPU, from small to paper size.
         x = image.flatten(0, -4).contiguous(memory_format=th.channels_last)
         for conv in self.convs:
-            x = self.activation(conv(x))
-        return x.reshape(image.shape[:-3] + (self.embed_size,))
+            assert isinstance(conv, nn.Conv2d)
+            x = self.activation(convolve(conv, x))
+        return full(x).reshape(image.shape[:-3] + (self.embed_size,))

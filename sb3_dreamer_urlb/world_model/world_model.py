@@ -65,7 +65,7 @@ class WorldModel(nn.Module):
     @staticmethod
     def preprocess(observation: th.Tensor) -> th.Tensor:
         """uint8 images in [0, 255] → float32 in [-0.5, 0.5], same shape."""
-        return observation.to(th.float32) / 255.0 - 0.5
+        return th.div(observation, 255.0).sub_(0.5)
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
