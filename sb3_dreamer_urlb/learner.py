@@ -16,6 +16,7 @@ from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
+from sb3_dreamer_urlb.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.optim import ClippedAdam
 from sb3_dreamer_urlb.types import LatentState, Metrics, Posterior, SequenceBatch
 
@@ -62,6 +63,7 @@ class Learner:
             self.reward_source = agent.intrinsic
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
+        self.guard = UpdateGuard(agent, self.optimizers())
 
     def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
         config = self.config
@@ -79,11 +81,15 @@ class Learner:
         return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
 
     def update(self, batch: SequenceBatch) -> Metrics:
-        """Learn from one batch.
+        """Learn from one batch; parts whose loss or gradient is not finite do not.
 
         :param batch: (B, T, …) on the agent's device
         :return: metrics, detached scalars on the device
         """
+        with self.guard.watching():
+            return self._update(batch)
+
+    def _update(self, batch: SequenceBatch) -> Metrics:
         model = self.agent.world_model
         image = model.preprocess(batch.observation)
         posterior = model.observe(image, batch.action, batch.is_first)

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.env_steps import is_fault
 from sb3_dreamer_urlb.types import SequenceBatch
 
 
@@ -158,7 +159,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param action: as executed, in [-1, 1], (n_envs, A)
         :param reward: (n_envs,)
         :param done: (n_envs,)
-        :param infos: ``TimeLimit.truncated`` tells truncation from termination
+        :param infos: ``TimeLimit.truncated`` tells truncation from termination; a step marked as a fault is not stored, and
+            ends the episode before it as truncated
         :param skill: that each action followed, (n_envs, W); None without skills
         :raises ValueError: for skills of another shape
         """
@@ -166,6 +168,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         if skill.shape != (self.n_envs, self.skill_size):
             raise ValueError(f"Skills must have the shape {(self.n_envs, self.skill_size)}, got {skill.shape}.")
         for i in range(self.n_envs):
+            if is_fault(infos[i]):
+                self._finish(i)
+                continue
             episode = self.open[i]
             if episode is None:
                 episode = self.open[i] = Episode(np.asarray(obs[i]), self.action_dim, skill[i])
