@@ -179,7 +179,7 @@ def test_faults_are_logged(tiny_model, tmp_path):
     rows = type("Rows", (KVWriter,), {"write": lambda _, values, *args, **kwargs: logged.append(dict(values))})()
     model.set_logger(Logger(None, [rows]))
     model.learn(100, log_interval=1)
-    assert [row["rollout/env_faults"] for row in logged][0] == 0 and logged[-1]["rollout/env_faults"] == 1
+    assert logged[0]["rollout/env_faults"] == 0 and logged[-1]["rollout/env_faults"] == 1
 
 
 def test_without_a_guard_the_error_names_environment_and_step(tiny_model):

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 
 
 class Harmful(CounterEnv):
-    """Does what its action says: above 0.9 it kills its process, below -0.9 it hangs; another dimension raises or gives NaN."""
+    """Does what its action says: beyond 0.9 it kills its process, hangs, raises or gives NaN."""
 
     def step(self, action):
         if action[0] > 0.9:
@@ -131,7 +131,7 @@ def test_a_worker_that_dies_between_steps(two):
     assert two.get_attr("marked") == ["yes", "yes"]  # asked again, of the new one
     *_, done, info = two.step([GOOD, GOOD])
     assert done.tolist() == [True, False] and "SIGKILL" in info[0][FAULT]
-    with pytest.raises(EnvironmentFaultError, match="Environment 0, method .*die.*SIGKILL"):
+    with pytest.raises(EnvironmentFaultError, match=r"Environment 0, method .*die.*SIGKILL"):
         two.env_method("die", indices=0)
 
 

@@ -72,13 +72,13 @@ class SupervisedVecEnv(VecEnv):
                 self.workers.append(self._new_worker(i))
             for worker in self.workers:
                 worker.send("spaces")
-            observation_space, action_space = [worker.receive() for worker in self.workers][0]
+            answers = [worker.receive() for worker in self.workers]
         except Exception as error:
             self.close()
             if isinstance(error, WorkerFault):
                 raise EnvironmentFaultError(f"An environment cannot be made: {error}.") from None
             raise
-        super().__init__(len(env_fns), observation_space, action_space)
+        super().__init__(len(env_fns), *answers[0])
 
     def _new_worker(self, i: int) -> Worker:
         counter = self.counters[i]
