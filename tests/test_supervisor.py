@@ -216,12 +216,12 @@ def test_dict_observations():
 
 
 def test_a_run_over_dying_workers(tiny_model):
-    env = make_supervised_vec_env(functools.partial(Harmful, 20), 2, vec_env_kwargs={"step_timeout": 60.0})
+    env = make_supervised_vec_env(functools.partial(CounterEnv, 20), 2, vec_env_kwargs={"step_timeout": 60.0})
     model = tiny_model(env, buffer_size=1000)
 
     def kill(local, _):
         if local["self"].num_timesteps in (60, 130):
-            os.kill(env.env_method("pid")[1], signal.SIGKILL)
+            os.kill(env.workers[1].process.pid, signal.SIGKILL)
         return True
 
     model.learn(200, callback=kill)
