@@ -12,6 +12,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 
 from sb3_dreamer_urlb import dreamer_v2, envs
+from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
@@ -70,7 +71,7 @@ def test_a_run_that_goes_on(small_world, tmp_path):
 def test_guards_and_a_replay_on_disk(small_world, tmp_path, monkeypatch):
     _, guards, disk = code_blocks("docs/reliability.md")
     asked = []
-    monkeypatch.setattr(envs.supervisor, "make_vec_env", lambda *args, **kwargs: asked.append((args, kwargs)))
+    monkeypatch.setattr(supervisor, "make_vec_env", lambda *args, **kwargs: asked.append((args, kwargs)))
     names = run(guards.replace("env = make_supervised", "other = make_supervised"), {"gymnasium": gymnasium})
     assert asked == [(("urlb/walker-run-v0", 4), {"vec_env_cls": envs.SupervisedVecEnv})]
     assert isinstance(names["env"], envs.FaultGuard)

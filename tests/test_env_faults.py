@@ -115,6 +115,13 @@ def test_repeated_faults_end_the_run_with_one_error():
         env.step(ACTION)
 
 
+def test_a_guard_inside_a_guard_ends_the_run_all_the_same():
+    env = FaultGuard(FaultGuard(Faulty(100, bad_steps={1: PhysicsError("x")}), max_faults=1))
+    env.reset()
+    with pytest.raises(EnvironmentFaultError, match="fault 1 in a row"):
+        env.step(ACTION)
+
+
 @pytest.mark.parametrize("between", ["an episode", "many steps", "few steps"])
 def test_what_makes_a_row_of_faults_end(between):
     steps = {"an episode": 1, "many steps": FORGIVEN_AFTER, "few steps": FORGIVEN_AFTER - 1}[between]

@@ -139,6 +139,19 @@ def test_the_file_is_bounded(tmp_path):
     assert buffer.sample(20).observation.shape == (20, 10, 3, 64, 64)
 
 
+@pytest.mark.parametrize("length", [3, 7, 12, 19])
+def test_a_full_file_goes_on(tmp_path, length):
+    """Whatever little is left when an episode does not fit: there is room to remove others."""
+    buffer = SequenceReplayBuffer(
+        10**6, BIG, ACTION, "cpu", 1, batch_length=2, seed=0, store="lmdb", path=tmp_path, map_size=1 << 20
+    )
+    fill_big(buffer, 600, length)
+    assert buffer.evicted > 10 and buffer.can_sample()
+    assert (tmp_path / "replay" / "data.mdb").stat().st_size <= 1 << 20
+    last = buffer.episodes[len(buffer.episodes) - 1]
+    assert last.rows(len(last) - 1, len(last))["action"][0, 0] == 599 // length * length
+
+
 def test_an_episode_larger_than_the_file(tmp_path):
     buffer = SequenceReplayBuffer(
         10**6, BIG, ACTION, "cpu", 1, batch_length=10, seed=0, store="lmdb", path=tmp_path, map_size=1 << 20

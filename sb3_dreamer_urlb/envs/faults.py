@@ -93,6 +93,8 @@ class FaultGuard(gymnasium.Wrapper):
             try:
                 observation, info = self.env.reset(seed=seed, options=options)
                 reason = what_is_not_finite(observation, 0.0)
+            except EnvironmentFaultError:
+                raise  # of a guard inside this one
             except Exception as error:
                 reason = describe(error)
             if reason is None:
@@ -110,6 +112,8 @@ class FaultGuard(gymnasium.Wrapper):
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
             reason = what_is_not_finite(observation, reward)
+        except EnvironmentFaultError:
+            raise
         except Exception as error:
             reason = describe(error)
         if reason is not None:

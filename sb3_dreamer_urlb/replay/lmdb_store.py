@@ -25,6 +25,7 @@ META = b"meta"
 FREE_PAGES = 16
 #: what a file needs beyond the rows: pages, freed ones that readers still see
 SPARE = 64 << 20
+RESERVE = 1 << 20
 
 
 class ReplayStoreError(RuntimeError):
@@ -69,14 +70,16 @@ class LmdbStore:
     def __init__(
         self, path: Path, layout: dict[str, tuple[np.dtype, tuple[int, ...]]], identity: dict[str, Any], map_size: int
     ):
-        self.path, self.layout = path, layout
+        self.path, self.layout, self.map_size = path, layout, map_size
+        #: LMDB needs room even to remove something
+        self.reserve = min(map_size // 8, RESERVE)
         self.row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
         columns = {name: [str(dtype), list(shape)] for name, (dtype, shape) in layout.items()}
         self._identity = {"version": VERSION, "chunk": CHUNK, "columns": columns, **identity}
         self.path.mkdir(parents=True, exist_ok=True)
         self._lock = self._take_lock()
         try:
-            self.env = lmdb.open(str(path), map_size=map_size, readahead=False, meminit=False, max_dbs=0)
+            self.env = lmdb.open(str(path), map_size=map_size - self.reserve, readahead=False, meminit=False, max_dbs=0)
         except lmdb.Error as error:
             self._lock.close()
             raise ReplayStoreError(f"{path} cannot be opened: {error}") from None
@@ -166,11 +169,13 @@ class LmdbStore:
                 leaving, gone = max(leaving, -(-len(self) // 8)), leaving
                 if not len(self):
                     raise ReplayStoreError(
-                        f"{self.path}: map_size={self.env.info()['map_size']} bytes are too few for one episode."
+                        f"{self.path}: map_size={self.map_size} bytes are too few for one episode."
                     ) from None
                 # First make room: LMDB reuses pages from the second transaction after the one that freed them.
+                self.env.set_mapsize(self.map_size)
                 self._write(None, leaving, self.counters)
                 self._write(None, 0, self.counters)
+                self.env.set_mapsize(self.map_size - self.reserve)
                 more, leaving = more + leaving - gone, 0
             except lmdb.DiskError as error:
                 raise OSError(f"{error} (the replay stays as it was): {self.path}") from None
