@@ -27,13 +27,25 @@ INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
         [("run_folder", "sigterm"), ("run_folder", "the_second"), ("run_folder", "sigint")],
         "checkpoint and exit; at once",
     ),
-    "snapshots and replay files cut, with flipped bits, doubled bytes": (
-        [("snapshot", "damaged"), ("snapshot", "stumps"), ("stores", "a_damaged"), ("stores", "missing_rows")],
-        "refused, or the same",
+    "400 snapshots and 60 replay files with flipped bits, cuts, doubled bytes": (
+        [("snapshot", "damaged"), ("snapshot", "stumps")],
+        "refused, or the same model",
     ),
-    "malicious files under an audit hook": (
-        [("snapshot", name) for name in ("loading_runs", "a_pickle", "members_that", "the_zip", "large", "fields", "bare")],
-        "refused; no code runs",
+    "replay on disk cut, overwritten, without its cursor, with rows missing": (
+        [("stores", "a_damaged"), ("stores", "missing_rows")],
+        "refused, or one error that names the rows",
+    ),
+    "pickles in every member, foreign members, paths that leave the folder, compressed members, wrong sizes, 20,000 members": (
+        [("snapshot", "a_pickle"), ("snapshot", "members_that"), ("snapshot", "the_zip"), ("snapshot", "bare")],
+        "refused; under an audit hook no pickle, exec, import, system call or subprocess",
+    ),
+    "JSON with double keys, NaN, depth, long numbers; `predict` among the fields; values of wrong type and range": (
+        [("snapshot", "json_out"), ("snapshot", "fields"), ("snapshot", "values"), ("snapshot", "loading_runs")],
+        "refused, likewise",
+    ),
+    "tables of tensors with other names, types, shapes; networks of terabytes": (
+        [("snapshot", "tensors_that"), ("snapshot", "large")],
+        "refused before memory is taken",
     ),
     "full disk, full device, file size limit": (
         [("run_folder", "a_full_disk"), ("snapshot", "a_full_device")],

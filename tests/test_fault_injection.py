@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import functools
 import io
 import os
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from faults import INJECTIONS
 from test_run_folder import everything, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
@@ -167,5 +167,13 @@ def test_soak(tiny_model, tmp_path):
     print(f"memory grew by {growth} kB, open files {first['files']} → {last['files']}, threads {last['threads']}")
 
 
-def test_nothing_is_left_patched():
-    assert atomic.__dict__.get("open", builtins.open) is builtins.open and os.replace.__module__ == "posix"
+def test_the_table_names_tests_that_exist():
+    for injection, (tests, _) in INJECTIONS.items():
+        for file, name in tests:
+            assert f"def test_{name}" in (Path(__file__).parent / f"test_{file}.py").read_text(), injection
+
+
+def test_the_page_shows_the_table():
+    page = (Path(__file__).parent.parent / "docs" / "reliability.md").read_text()
+    for injection, (_, outcome) in INJECTIONS.items():
+        assert f"| {injection} | {outcome} |" in page
