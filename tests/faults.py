@@ -48,8 +48,8 @@ INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
         "refused before memory is taken",
     ),
     "full disk, full device, file size limit": (
-        [("run_folder", "a_full_disk"), ("snapshot", "a_full_device")],
-        "last checkpoint intact, one error with the path",
+        [("run_folder", "a_full_disk"), ("snapshot", "a_full_device"), ("stores", "a_full_disk")],
+        "last checkpoint and rows intact, one error with the path",
     ),
     "a replay file that may not grow": ([("stores", "the_file_is_bounded")], "the oldest episodes go"),
     "two runs in one folder, two buffers in one file": (

@@ -19,7 +19,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from test_replay import ACTION, IMAGE, Streams, check_rows, decode, held, make_buffer
-from test_run_folder import vec_env
+from test_run_folder import SmallDisk, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer, stores
@@ -160,6 +160,24 @@ def test_an_episode_larger_than_the_file(tmp_path):
     with pytest.raises(ReplayStoreError, match="map_size=1048576 bytes are too few for one episode"):
         for t in range(200):
             buffer.add(zeros, zeros, np.zeros((1, 2)), np.zeros(1), np.array([t == 199]), [{}])
+
+
+def test_a_full_disk_leaves_the_rows_there(tmp_path):
+    disk = SmallDisk(tmp_path)  # 1 MB
+    try:
+        buffer = SequenceReplayBuffer(
+            10**6, BIG, ACTION, "cpu", 1, batch_length=10, seed=0, store="lmdb", path=disk.folder, map_size=8 << 20
+        )
+        with pytest.raises(OSError, match=rf"\d+ bytes are free \(the replay stays as it was\): {disk.folder}"):
+            fill_big(buffer, 600)
+        held = len(buffer.episodes)
+        assert held > 0 and buffer.sample(20).observation.shape[0] == 20
+        for _ in range(2):
+            buffer.episodes.popleft()  # it stays usable
+        assert len(buffer.episodes) == held - 2
+    finally:
+        buffer.disk.close()
+        disk.close()
 
 
 # -- refusals --------------------------------------------------------------------------------------------------------------

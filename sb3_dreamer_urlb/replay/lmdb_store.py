@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import shutil
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -177,8 +178,10 @@ class LmdbStore:
                 self._write(None, 0, self.counters)
                 self.env.set_mapsize(self.map_size - self.reserve)
                 more, leaving = more + leaving - gone, 0
-            except lmdb.DiskError as error:
-                raise OSError(f"{error} (the replay stays as it was): {self.path}") from None
+            except lmdb.Error as error:
+                # LMDB calls a full disk an input/output error.
+                free = shutil.disk_usage(self.path).free
+                raise OSError(f"{error}, {free} bytes are free (the replay stays as it was): {self.path}") from None
 
     def _write(self, episode: Any, leaving: int, counters: dict[str, int]) -> None:
         first = self.first + leaving
