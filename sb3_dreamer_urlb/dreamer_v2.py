@@ -218,6 +218,10 @@ class DreamerV2(OffPolicyAlgorithm):
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        path = self.replay_buffer_kwargs.get("path")
+        if isinstance(path, os.PathLike):
+            # As snapshots can hold it.
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
         arguments.check(self)
         self._convert_train_freq()
         self._read_env()

@@ -279,7 +279,7 @@ def test_the_memory_of_this_machine():
 
 
 def test_a_run_on_disk_resumes_with_the_rows_of_its_checkpoint(tiny_model, tmp_path):
-    kwargs = {"replay_buffer_kwargs": {"store": "lmdb", "path": str(tmp_path / "replay")}, "intrinsic_reward": "lbs"}
+    kwargs = {"replay_buffer_kwargs": {"store": "lmdb", "path": tmp_path / "replay"}, "intrinsic_reward": "lbs"}
     model = tiny_model(vec_env(2), **kwargs)
     model.learn(120, callback=RunCheckpointCallback(tmp_path / "run"))
     expected = contents(model.replay_buffer)
