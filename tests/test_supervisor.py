@@ -149,6 +149,14 @@ def test_repeated_deaths_end_the_run_with_one_error():
     env.close()
 
 
+def test_a_death_before_a_reset_is_counted_with_the_next_step(two):
+    os.kill(two.env_method("pid")[1], signal.SIGKILL)
+    two.workers[1].process.join(10)
+    assert two.reset().shape == (2, 16, 16, 3)
+    *_, done, info = two.step([GOOD, GOOD])
+    assert not done.any() and FAULTS not in info[0] and info[1][FAULTS] == 1 and FAULT not in info[1]
+
+
 def test_after_an_error_old_answers_are_not_mistaken(two):
     two.reset()
     two.step_async(np.array([GOOD, GOOD]))
@@ -194,8 +202,9 @@ def test_an_action_that_is_not_finite_is_refused(two):
     ("kwargs", "message"),
     [
         ({"start_method": "fork"}, r"start_method='fork': expected one of \['forkserver', 'spawn'\].*hangs"),
-        ({"step_timeout": 0}, "step_timeout must be positive, got 0"),
-        ({"start_timeout": math.nan}, "start_timeout must be positive, got nan"),
+        ({"step_timeout": 0}, "step_timeout must be positive and finite, got 0"),
+        ({"start_timeout": math.nan}, "start_timeout must be positive and finite, got nan"),
+        ({"step_timeout": math.inf}, "step_timeout must be positive and finite, got inf"),
         ({"max_faults": 0}, "max_faults must be positive, got 0"),
     ],
 )

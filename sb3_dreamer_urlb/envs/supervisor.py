@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
@@ -51,8 +52,8 @@ class SupervisedVecEnv(VecEnv):
         max_faults: int = 10,
     ):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
-            if not seconds > 0:
-                raise ValueError(f"{name} must be positive, got {seconds!r}.")
+            if not 0 < seconds < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {seconds!r}.")
         self.context = start_context(start_method)
         self.env_fns = [CloudpickleWrapper(env_fn) for env_fn in env_fns]
         self.step_timeout, self.start_timeout, self.max_faults = step_timeout, start_timeout, max_faults
@@ -117,6 +118,8 @@ class SupervisedVecEnv(VecEnv):
                     self.counters[i].steps += 1
                 else:
                     self.counters[i].good(result[2])
+                if earlier := self.counters[i].take():
+                    result[3][FAULTS] = result[3].get(FAULTS, 0) + earlier
                 return result
             except WorkerFault as fault:
                 self._replace(i, fault)
