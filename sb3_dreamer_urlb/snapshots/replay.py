@@ -89,6 +89,8 @@ def load(buffer: SequenceReplayBuffer, source: Target) -> None:
     :raises SnapshotError: naming the file and why it is refused
     """
     with reading(source, KIND, suffix="pkl") as archive:
+        if buffer.path is not None:
+            raise ValueError(f"the model keeps its replay on disk, in {buffer.path}, and takes no other")
         data = _checked_data(buffer, archive)
         episodes = list(_episodes(buffer, archive))
         count = len(data["streams"])
@@ -123,10 +125,19 @@ def restore(buffer: SequenceReplayBuffer, finished: list[Episode], open_: list[E
     buffer.finished_rows = sum(map(len, finished))
     for name in ("evicted", "finished_count", "longest"):
         setattr(buffer, name, numbers[name])
+    close(buffer, open_)
+    buffer.evict()
+
+
+def close(buffer: SequenceReplayBuffer, open_: list[Episode]) -> None:
+    """Put episodes that were open at its end, as truncated.
+
+    :param buffer: with no open ones of its own
+    :param open_: in their order
+    """
     for episode in open_:
         buffer.open[0] = episode
         buffer.close_streams()
-    buffer.evict()
 
 
 def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, Any]:
