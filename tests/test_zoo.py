@@ -335,6 +335,7 @@ def test_snapshots_need_a_run(tiny_model, tmp_path, monkeypatch):
 
 
 def test_processes_are_supervised():
+    registration.register()
     for given, used in ((SubprocVecEnv, SupervisedVecEnv), (DummyVecEnv, DummyVecEnv)):
         manager = SimpleNamespace(vec_env_class=given)
         assert registration._create_envs(lambda its, n: (its.vec_env_class, n), manager, 3) == (used, 3)
