@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import pathlib
 from typing import Any, ClassVar, TypeVar
@@ -19,10 +20,11 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import arguments, phases
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
-from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
+from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.types import MetricMeans
@@ -41,8 +43,8 @@ class DreamerV2(OffPolicyAlgorithm):
     Units: ``learning_starts``, ``train_freq``, ``planner_delay`` and ``buffer_size`` count *agent steps*, as everywhere in
     SB3; ``phase_frames`` counts environment frames (agent steps × action repeat), as in the paper.
 
-    :param policy: ``"CnnPolicy"``
-    :param env: environment, vectorised or not, or its id; image observations, Box actions
+    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for a Dict of both
+    :param env: environment, vectorised or not, or its id; Box, Discrete or MultiDiscrete actions
     :param learning_rate: of the world model and the intrinsic reward; a number or a schedule
     :param actor_learning_rate: number or schedule
     :param critic_learning_rate: number or schedule
@@ -86,7 +88,11 @@ class DreamerV2(OffPolicyAlgorithm):
     :raises ValueError: for arguments or spaces that do not fit, before anything is built
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "CnnPolicy": CnnPolicy,
+        "MlpPolicy": MlpPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
     policy: DreamerPolicy
     policy_class: type[DreamerPolicy]
     replay_buffer: SequenceReplayBuffer
@@ -230,7 +236,7 @@ class DreamerV2(OffPolicyAlgorithm):
             discount_head=bool(self.discount_head),
             intrinsic=intrinsic,
             explores=explores,
-            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda),
+            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             **self.policy_kwargs,
         ).to(self.device)
         self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
@@ -331,6 +337,8 @@ class DreamerV2(OffPolicyAlgorithm):
         assert self.env is not None
         self.replay_buffer.close_streams()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
         self._last_episode_starts = np.ones(self.env.num_envs, bool)
 
     def prepare_env(self, env: GymEnv) -> VecEnv:
@@ -376,14 +384,13 @@ class DreamerV2(OffPolicyAlgorithm):
         """One step of the recurrent agent; what it remembers is the action *as executed*."""
         assert self._last_obs is not None and self._last_episode_starts is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        assert isinstance(observation, th.Tensor)
         state = self._acting_state or self.policy.initial_state(n_envs)
         self.policy.planning = self._planner_is_on()
         with th.no_grad():
             state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
             if phases.PHASES[self.phase].random_warmup and self.phase_timesteps < learning_starts:
                 uniform = np.stack([self.action_space.sample() for _ in range(n_envs)])
-                scaled = self.policy.scale_action(uniform).reshape(n_envs, -1)
+                scaled = self.policy.actions.from_env(uniform)
             else:
                 state = self.policy.choose(state, deterministic=False)
                 scaled = state.action.cpu().numpy()
@@ -405,22 +412,26 @@ class DreamerV2(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """As SB3's, but images are never normalised, and the recurrent state needs to know where episodes begin."""
-        if self._vec_normalize_env is not None:
-            reward = self._vec_normalize_env.get_original_reward()
+        """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
+        original_obs, normalizer = new_obs, self._vec_normalize_env
+        if normalizer is None:
+            self._last_original_obs = self._last_obs  # type: ignore[assignment]
+        else:
+            original_obs, reward = normalizer.get_original_obs(), normalizer.get_original_reward()
         if not np.isfinite(reward).all():
             bad = int(np.flatnonzero(~np.isfinite(reward))[0])
             raise ValueError(
                 f"Environment {bad} gave the reward {reward[bad]} at step {self.num_timesteps}; expected a finite one."
             )
         # The VecEnv has already begun the next episode: put the true last observation back.
-        next_obs = np.array(new_obs)
+        next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
-            next_obs[i] = infos[i].get("terminal_observation", next_obs[i])
-        assert isinstance(self._last_obs, np.ndarray) and self._acting_state is not None
+            if (last := infos[i].get("terminal_observation")) is not None:
+                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
+        assert self._acting_state is not None
         skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
-        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos, **skill)
-        self._last_obs = new_obs
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
+        self._last_obs, self._last_original_obs = new_obs, original_obs  # type: ignore[assignment]
         self._last_episode_starts = dones.astype(bool)
 
     # -- learning ------------------------------------------------------------------------------------------------------
@@ -566,3 +577,12 @@ class DreamerV2(OffPolicyAlgorithm):
         buffer.device = self.device
         buffer.close_streams()
         self.replay_buffer = buffer
+
+
+def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:
+    """Replace the observation of environment ``i``."""
+    if isinstance(observations, dict):
+        for name, values in observations.items():
+            values[i] = observation[name]  # type: ignore[call-overload]
+    else:
+        observations[i] = observation

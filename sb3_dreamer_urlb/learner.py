@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb.agent import Agent
@@ -17,7 +16,7 @@ from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.optim import ClippedAdam
-from sb3_dreamer_urlb.types import LatentState, Metrics, Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 
 @dataclass(frozen=True)
@@ -85,10 +84,10 @@ class Learner:
         :return: metrics, detached scalars on the device
         """
         model = self.agent.world_model
-        image = model.preprocess(batch.observation)
-        posterior = model.observe(image, batch.action, batch.is_first)
+        observation = model.preprocess(batch.observation)
+        posterior = model.observe(observation, batch.action, batch.is_first)
         metrics = self._update_intrinsic(_detached(posterior), batch)
-        metrics.update(self._update_world_model(posterior, image, batch))
+        metrics.update(self._update_world_model(posterior, observation, batch))
         if self.agent.trains_behavior():
             metrics.update(self._update_behavior(posterior.state.detach()))
             if self.agent.explores:
@@ -106,11 +105,11 @@ class Learner:
         metrics["intrinsic_loss"] = loss.detach()
         return metrics
 
-    def _update_world_model(self, posterior: Posterior, image: th.Tensor, batch: SequenceBatch) -> Metrics:
+    def _update_world_model(self, posterior: Posterior, observation: Observation, batch: SequenceBatch) -> Metrics:
         config = self.config
         reward = self.reward_source.replay_reward(_detached(posterior), batch)
         loss, metrics = self.agent.world_model.loss(
-            posterior, image, reward, batch.is_terminal, config.free_nats, config.kl_balance, config.reward_trains_model
+            posterior, observation, reward, batch.is_terminal, config.free_nats, config.kl_balance, config.reward_trains_model
         )
         if reward is not batch.reward:
             metrics["intrinsic_replay_reward"] = reward.mean()

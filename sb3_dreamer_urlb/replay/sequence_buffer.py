@@ -17,52 +17,107 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.types import SequenceBatch
 
+RawObservation = np.ndarray | dict[str, np.ndarray]
+#: column of an observation, or of the part of a Dict observation whose name follows
+OBSERVATION = "observation"
+
 
 class Episode:
     """Contiguous rows that grow while the episode is open.
 
-    :param observation: the episode's first observation
+    :param observation: the episode's first observation; a Dict observation takes one column for each part
     :param action_size: A
     :param skill: under which the first action is chosen, (W,)
     """
 
-    def __init__(self, observation: np.ndarray, action_size: int, skill: np.ndarray):
+    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray):
         capacity = 128
-        self.observation = np.empty((capacity, *observation.shape), observation.dtype)
-        self.action = np.zeros((capacity, action_size), np.float32)
-        self.reward = np.zeros(capacity, np.float32)
-        self.is_terminal = np.zeros(capacity, bool)
-        self.skill = np.zeros((capacity, len(skill)), np.float32)
-        self.length = 1
-        self.observation[0] = observation
-        self.skill[0] = skill
+        seen = observation_columns(observation)
+        #: rows of each column, the first ``length`` of them filled
+        self.columns = {
+            **{name: np.empty((capacity, *value.shape), value.dtype) for name, value in seen.items()},
+            "action": np.zeros((capacity, action_size), np.float32),
+            "reward": np.zeros(capacity, np.float32),
+            "is_terminal": np.zeros(capacity, bool),
+            "skill": np.zeros((capacity, len(skill)), np.float32),
+        }
+        self.length = 0
+        self._put({**seen, "skill": skill})
 
     def __len__(self) -> int:
         return self.length
 
-    def append(self, observation: np.ndarray, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray) -> None:
+    @property
+    def observation(self) -> RawObservation:
+        """All rows of it, by name for Dict observations."""
+        return observation_of(self.columns)
+
+    @property
+    def action(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["action"]
+
+    @property
+    def reward(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["reward"]
+
+    @property
+    def is_terminal(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["is_terminal"]
+
+    @property
+    def skill(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["skill"]
+
+    def append(
+        self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
+    ) -> None:
         """Add the row that ``action``, chosen under ``skill``, led to."""
         if self.length == len(self.reward):
             self._resize(2 * self.length)
-        t = self.length
-        self.observation[t] = observation
-        self.action[t] = action
-        self.reward[t] = reward
-        self.is_terminal[t] = is_terminal
-        self.skill[t] = skill
-        self.length += 1
+        seen = observation_columns(observation)
+        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
 
     def finish(self) -> Episode:
         """Give unused memory back."""
         self._resize(self.length)
         return self
 
+    def _put(self, row: dict[str, Any]) -> None:
+        for name, value in row.items():
+            self.columns[name][self.length] = value
+        self.length += 1
+
     def _resize(self, capacity: int) -> None:
-        for name in ("observation", "action", "reward", "is_terminal", "skill"):
-            old = getattr(self, name)
+        for name, old in self.columns.items():
             new = np.empty((capacity, *old.shape[1:]), old.dtype)
             new[: self.length] = old[: self.length]
-            setattr(self, name, new)
+            self.columns[name] = new
+
+
+def observation_columns(observation: RawObservation) -> dict[str, np.ndarray]:
+    """The columns that an observation fills: one, or one for each part of a Dict observation."""
+    if isinstance(observation, dict):
+        return {f"{OBSERVATION}/{name}": np.asarray(part) for name, part in observation.items()}
+    return {OBSERVATION: np.asarray(observation)}
+
+
+def observation_of(columns: dict[str, np.ndarray]) -> RawObservation:
+    """The observation among columns; undoes :func:`observation_columns`."""
+    if OBSERVATION in columns:
+        return columns[OBSERVATION]
+    prefix = f"{OBSERVATION}/"
+    return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}
+
+
+def _row(observation: RawObservation, i: int) -> RawObservation:
+    """The observation of environment ``i``."""
+    if isinstance(observation, dict):
+        return {name: part[i] for name, part in observation.items()}
+    return np.asarray(observation[i])
 
 
 class SequenceReplayBuffer(ReplayBuffer):
@@ -128,8 +183,8 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def add(  # type: ignore[override]
         self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
+        obs: RawObservation,
+        next_obs: RawObservation,
         action: np.ndarray,
         reward: np.ndarray,
         done: np.ndarray,
@@ -138,9 +193,9 @@ class SequenceReplayBuffer(ReplayBuffer):
     ) -> None:
         """Store one step of every environment.
 
-        :param obs: what was seen, (n_envs, …); it is a row of its own only where an episode begins
+        :param obs: what was seen, (n_envs, …), by name for Dicts; it is a row of its own only where an episode begins
         :param next_obs: what followed, (n_envs, …); the true last observation where ``done``, not the next episode's first
-        :param action: as executed, in [-1, 1], (n_envs, A)
+        :param action: as executed, in [-1, 1] or one-hot, (n_envs, A)
         :param reward: (n_envs,)
         :param done: (n_envs,)
         :param infos: ``TimeLimit.truncated`` tells truncation from termination
@@ -153,9 +208,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         for i in range(self.n_envs):
             episode = self.open[i]
             if episode is None:
-                episode = self.open[i] = Episode(np.asarray(obs[i]), self.action_dim, skill[i])
+                episode = self.open[i] = Episode(_row(obs, i), action[i].size, skill[i])
             terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
-            episode.append(next_obs[i], action[i].reshape(-1), float(reward[i]), terminal, skill[i])
+            episode.append(_row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i])
             if done[i] or len(episode) >= self.max_episode_rows:
                 self._finish(i)
 
@@ -187,30 +242,36 @@ class SequenceReplayBuffer(ReplayBuffer):
         """Draw sequences: an episode uniformly, then a start uniformly (spec/algorithms §3).
 
         :param batch_size: B
-        :param env: normalises rewards if given
+        :param env: normalises observations and rewards if given
         :return: (B, T, …) on ``device``
         :raises ValueError: if no finished episode has ``batch_length`` rows
         """
         if not self.can_sample():
             raise ValueError(f"No finished episode has batch_length={self.batch_length} rows yet.")
         length = self.batch_length
-        first = self.episodes[0]
-        observation = np.empty((batch_size, length, *first.observation.shape[1:]), first.observation.dtype)
-        action = np.empty((batch_size, length, self.action_dim), np.float32)
-        reward = np.empty((batch_size, length), np.float32)
-        is_terminal = np.empty((batch_size, length), bool)
-        skill = np.empty((batch_size, length, self.skill_size), np.float32)
+        columns = {
+            name: np.empty((batch_size, length, *rows.shape[1:]), rows.dtype)
+            for name, rows in self.episodes[0].columns.items()
+        }
         for b, index in enumerate(self.rng.integers(len(self.episodes), size=batch_size)):
             episode = self.episodes[index]
             start = self.rng.integers(len(episode) - length + 1)
-            rows = slice(start, start + length)
-            observation[b] = episode.observation[rows]
-            action[b] = episode.action[rows]
-            reward[b] = episode.reward[rows]
-            is_terminal[b] = episode.is_terminal[rows]
-            skill[b] = episode.skill[rows]
+            for name, rows in episode.columns.items():
+                columns[name][b] = rows[start : start + length]
         is_first = np.zeros((batch_size, length), bool)
         is_first[:, 0] = True
-        reward = self._normalize_reward(reward, env).astype(np.float32, copy=False)
-        parts = [observation, action, reward, is_first, is_terminal, *([skill] if self.skill_size else [])]
-        return SequenceBatch(*(th.from_numpy(part).to(self.device, non_blocking=True) for part in parts))
+        observation = self._normalize_obs(observation_of(columns), env)
+        reward = self._normalize_reward(columns["reward"], env).astype(np.float32, copy=False)
+        return SequenceBatch(
+            {name: self._tensor(part) for name, part in observation.items()}
+            if isinstance(observation, dict)
+            else self._tensor(observation),
+            self._tensor(columns["action"]),
+            self._tensor(reward),
+            self._tensor(is_first),
+            self._tensor(columns["is_terminal"]),
+            self._tensor(columns["skill"]) if self.skill_size else None,
+        )
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.from_numpy(array).to(self.device, non_blocking=True)
