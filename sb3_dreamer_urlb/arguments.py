@@ -186,10 +186,8 @@ def check_episode_length(buffer: SequenceReplayBuffer) -> None:
 
 def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
     """An attribute of the first environment, through all wrappers; ``default`` where there is none."""
-    try:
-        return env.get_attr(name, indices=0)[0]
-    except AttributeError:
-        return default
+    # Asking a SubprocVecEnv for an attribute that is not there would end its processes.
+    return env.get_attr(name, indices=0)[0] if env.has_attr(name) else default
 
 
 def check_load_keywords(algorithm: type[DreamerV2], kwargs: dict[str, Any]) -> None:

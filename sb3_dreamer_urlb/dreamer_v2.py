@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import arguments, phases
 from sb3_dreamer_urlb.actions import make_actions
@@ -83,7 +83,8 @@ class DreamerV2(OffPolicyAlgorithm):
     :param verbose: 0 quiet, 1 info, 2 debug
     :param seed: of everything random
     :param device: "auto", "cpu", "cuda"
-    :param preset: ``"paper"``, ``"small"`` (two CPU cores) or ``"tiny"`` (tests); replaces defaults, never what you write
+    :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
+        replaces defaults, never what you write
     :param _init_setup_model: build the networks now
     :raises ValueError: for arguments or spaces that do not fit, before anything is built
     """
@@ -338,7 +339,7 @@ class DreamerV2(OffPolicyAlgorithm):
         self.replay_buffer.close_streams()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         if self._vec_normalize_env is not None:
-            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, bool)
 
     def prepare_env(self, env: GymEnv) -> VecEnv:
@@ -413,11 +414,11 @@ class DreamerV2(OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
-        original_obs, normalizer = new_obs, self._vec_normalize_env
+        normalizer = self._vec_normalize_env
         if normalizer is None:
-            self._last_original_obs = self._last_obs  # type: ignore[assignment]
+            self._last_original_obs, original_obs = self._last_obs, new_obs  # type: ignore[assignment]
         else:
-            original_obs, reward = normalizer.get_original_obs(), normalizer.get_original_reward()
+            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
         if not np.isfinite(reward).all():
             bad = int(np.flatnonzero(~np.isfinite(reward))[0])
             raise ValueError(
@@ -433,6 +434,11 @@ class DreamerV2(OffPolicyAlgorithm):
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
         self._last_obs, self._last_original_obs = new_obs, original_obs  # type: ignore[assignment]
         self._last_episode_starts = dones.astype(bool)
+
+    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
+        """The last observation before normalisation, with channels first as the model sees it."""
+        original = normalizer.get_original_obs()
+        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
@@ -489,7 +495,10 @@ class DreamerV2(OffPolicyAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             # The environments are about to be reset.
             self.replay_buffer.close_streams()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
+        return result
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Update on replayed sequences; does nothing while no finished episode is long enough.
