@@ -1,4 +1,4 @@
-"""What the benchmarks share: options, a model without an environment, timing, a report."""
+"""What the benchmarks share: options, a model without an environment, timing, floors, a report."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -41,41 +43,132 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     """Options that every benchmark takes."""
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--preset", default="paper", help="size of the model (default: paper)")
+    options.add_argument("--precision", nargs="+", default=["float32", "bfloat16"], help="formats of products to compare")
     options.add_argument("--repeat", type=int, default=3, help="timed repetitions, after one that is not (default: 3)")
+    options.add_argument("--threads", type=int, help="of torch (default: as many as torch takes)")
+    options.add_argument(
+        "--clock",
+        choices=CLOCKS,
+        default="wall",
+        help="cpu counts this process's CPU time: for one thread on a machine that others use, too",
+    )
     options.add_argument("--device", default="auto")
     options.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     return options
 
 
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
 def make_model(options: argparse.Namespace, **kwargs: object) -> DreamerV2:
     """A fresh model on noise images."""
+    if getattr(options, "threads", None):
+        th.set_num_threads(options.threads)
     return DreamerV2("CnnPolicy", NoiseImages(), preset=options.preset, device=options.device, seed=0, **kwargs)
 
 
-def seconds(work: Callable[[], object], repeat: int, device: th.device) -> list[float]:
-    """Wall time of each repetition; the first run warms up and does not count."""
+def seconds(work: Callable[[], object], repeat: int, device: th.device, clock: str = "wall", warm_up: int = 1) -> list[float]:
+    """Time of each repetition; the warming up does not count."""
     times = []
-    for _ in range(repeat + 1):
-        begin = time.perf_counter()
+    for _ in range(repeat + warm_up):
+        begin = CLOCKS[clock]()
         work()
         if device.type == "cuda":
             th.cuda.synchronize(device)
-        times.append(time.perf_counter() - begin)
-    return times[1:]
+        times.append(CLOCKS[clock]() - begin)
+    return times[warm_up:]
 
 
-def report(name: str, rows: dict[str, list[float]], options: argparse.Namespace, device: th.device) -> None:
-    """Print the table, or the JSON object."""
-    machine = {
-        "device": th.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine(),
+def interleaved(
+    work: dict[str, Callable[[], object]], options: argparse.Namespace, device: th.device
+) -> dict[str, list[float]]:
+    """Times of each entry; they take turns, so that what else the machine does meets all of them."""
+    rows: dict[str, list[float]] = {name: [] for name in work}
+    for turn in range(options.repeat + 1):
+        for name, part in work.items():
+            times = seconds(part, 1, device, options.clock, warm_up=0)
+            rows[name] += times if turn else []
+    return rows
+
+
+class Product:
+    """A big matrix product, 4096³: the arithmetic that a machine can do at best, in one format.
+
+    :param dtype: format
+    :param device: where
+    """
+
+    SIZE = 4096
+    TFLOP = 2 * SIZE**3 / 1e12
+
+    def __init__(self, dtype: th.dtype, device: th.device):
+        self.left, self.right = (th.randn(self.SIZE, self.SIZE, device=device).to(dtype) for _ in range(2))
+
+    def __call__(self) -> th.Tensor:
+        return self.left @ self.right
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What a row is compared with.
+
+    :param row: its name
+    :param factor: that many times it
+    :param target: the ratio to stay below
+    """
+
+    row: str
+    factor: float
+    target: float | None = None
+
+
+def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]:
+    """Where and how something was timed."""
+    return {
+        "device": th.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
         "threads": th.get_num_threads(),
+        "clock": options.clock,
         "torch": th.__version__,
+        "python": platform.python_version(),
         "preset": options.preset,
     }
+
+
+def _cpu_name() -> str:
+    """With the units that decide how fast bfloat16 is; Linux only, elsewhere what Python knows."""
+    try:
+        info = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor() or platform.machine()
+    fields = dict(line.split(":", 1) for line in info.splitlines() if ":" in line)
+    found = {name.strip(): value.strip() for name, value in fields.items()}
+    units = [unit for unit in ("avx512_bf16", "amx_bf16") if unit in found.get("flags", "").split()]
+    return " ".join([found.get("model name", platform.machine()), *units])
+
+
+def report(
+    name: str, rows: dict[str, list[float]], floors: dict[str, Floor], options: argparse.Namespace, device: th.device
+) -> None:
+    """Print the table, ratios first, or the JSON object. A ratio is best time over best time.
+
+    :param name: of the benchmark
+    :param rows: times of everything measured, the floors' rows included
+    :param floors: what rows are compared with
+    :param options: of the command line
+    :param device: that was measured
+    """
+    about = machine(options, device)
+    ratios = {row: min(rows[row]) / (floor.factor * min(rows[floor.row])) for row, floor in floors.items() if row in rows}
     if options.json:
-        print(json.dumps({"benchmark": name, **machine, "seconds": rows}))
+        print(json.dumps({"benchmark": name, **about, "ratios": ratios, "seconds": rows}))
         return
-    print(f"{name}: {', '.join(f'{key} {value}' for key, value in machine.items())}")
+    print(f"{name}: {', '.join(f'{key} {value}' for key, value in about.items())}")
     width = max(map(len, rows))
-    for row, times in rows.items():
-        print(f"  {row:<{width}}  {statistics.median(times):8.4f} s  (best {min(times):.4f} of {len(times)})")
+    for row in [*ratios, *(row for row in rows if row not in ratios)]:
+        ratio, compared = "", ""
+        if row in ratios:
+            ratio, floor = f"{ratios[row]:.2f} ×", floors[row]
+            target = "" if floor.target is None else f", target {floor.target:g}"
+            compared = f"  ({floor.factor:.4g} × {floor.row}{target})"
+        times = rows[row]
+        print(f"  {ratio:>8}  {row:<{width}}  {min(times):8.4f} s, median {statistics.median(times):.4f}{compared}")

@@ -1,24 +1,40 @@
-"""Seconds per action, with and without the planner, paper size unless told otherwise: ``python benchmarks/planner.py``."""
+"""An action against the machine's limit, with and without the planner: ``python benchmarks/planner.py``, paper size.
+
+The floor of a planned action is the time that the authors' arithmetic, 195 GFLOP, takes as big bfloat16 products; that of ten
+environments is one environment.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-from common import make_model, parser, report, seconds
+import torch as th
+from common import Floor, Product, interleaved, make_model, parser, report
+
+TFLOP = 0.195
+PRODUCT = "product of 4096³ in bfloat16"
 
 
 def main() -> None:
-    """Time ``predict`` on one and on ten environments, with Dyna-MPC and with the actor, interleaved."""
+    """Time ``predict`` on one and on ten environments, with Dyna-MPC in each format and with the actor."""
     options = parser(__doc__).parse_args()
-    model = make_model(options, planner="dyna_mpc", learning_starts=0, planner_delay=0)
     images = np.random.default_rng(0).integers(0, 256, (10, 64, 64, 3), np.uint8)
-    rows: dict[str, list[float]] = {}
-    for _ in range(options.repeat):
-        for planner, name in ((True, "Dyna-MPC"), (False, "actor")):
-            for n in (1, 10):
-                model.planner = "dyna_mpc" if planner else None
-                work = lambda n=n: model.predict(images[:n])  # noqa: E731
-                rows.setdefault(f"{name}, {n} environment{'s' * (n > 1)}", []).extend(seconds(work, 1, model.device))
-    report("action", rows, options, model.device)
+    work: dict[str, Callable[[], object]] = {}
+    floors = {}
+    for precision in options.precision:
+        model = make_model(options, precision=precision, planner="dyna_mpc", learning_starts=0, planner_delay=0)
+        one, ten = (f"Dyna-MPC, {environments}, {precision}" for environments in ("1 environment", "10 environments"))
+        work[one] = lambda model=model: model.predict(images[:1])
+        work[ten] = lambda model=model: model.predict(images)
+        if options.preset == "paper":
+            floors[one] = Floor(PRODUCT, TFLOP / Product.TFLOP, 1.0)
+        floors[ten] = Floor(one, 1.0, 8.0)
+    work[PRODUCT] = Product(th.bfloat16, model.device)
+    actor = make_model(options)
+    work["actor, 1 environment"] = lambda: actor.predict(images[:1])
+    work["actor, 10 environments"] = lambda: actor.predict(images)
+    report("action", interleaved(work, options, model.device), floors, options, model.device)
 
 
 if __name__ == "__main__":

@@ -1,54 +1,63 @@
-"""Seconds per update, paper size unless told otherwise (batch 50×50, H = 15): ``python benchmarks/update.py``."""
+"""An update against the machine's limit: ``python benchmarks/update.py``, paper size unless told otherwise (50×50, H = 15).
+
+The floor is the time that the authors' arithmetic of an update, 2.4 TFLOP, takes as big matrix products in the same format.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from common import make_model, parser, report, seconds
+import torch as th
+from common import Floor, Product, interleaved, make_model, parser, report
 
 from sb3_dreamer_urlb.learner import Learner
-from sb3_dreamer_urlb.types import Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import SequenceBatch
+
+TFLOP = 2.4
+TARGETS = {"float32": 1.0, "bfloat16": 2.0}
 
 
-def world_model_pass(learner: Learner, batch: SequenceBatch) -> Callable[[], Posterior]:
-    """The world model's part of an update: infer, loss, step."""
+def parts(learner: Learner, batch: SequenceBatch) -> dict[str, Callable[[], object]]:
+    """The two halves of an update by name."""
 
-    def work() -> Posterior:
+    def world_model() -> None:
         model = learner.agent.world_model
         image = model.preprocess(batch.observation)
-        posterior = model.observe(image, batch.action, batch.is_first)
+        with learner._products():
+            posterior = model.observe(image, batch.action, batch.is_first)
         learner._update_world_model(posterior, image, batch)
-        return posterior
 
-    return work
+    with th.no_grad():
+        model = learner.agent.world_model
+        state = model.observe(model.preprocess(batch.observation), batch.action, batch.is_first).state
+    return {"world model": world_model, "behaviour": lambda: learner._update_behavior(state)}
 
 
 def main() -> None:
-    """Time a pre-training update (LBS) and a fine-tuning update, whole and in parts, interleaved."""
-    options = parser(__doc__).parse_args()
-    learners = {
-        "pre-training (LBS)": make_model(options, intrinsic_reward="lbs"),
-        "fine-tuning": make_model(options),
-    }
-    rows: dict[str, list[float]] = {}
-    batches = {}
-    for name, model in learners.items():
-        model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
-        batches[name] = model.replay_buffer.sample(model.batch_size)
-    for _ in range(options.repeat):
-        for name, model in learners.items():
-            learner, batch, device = model.learner, batches[name], model.device
-            model_pass = world_model_pass(learner, batch)
-            posterior = model_pass()
-            work = {
-                name: lambda learner=learner, batch=batch: learner.update(batch),
-                f"{name}, world model": lambda model_pass=model_pass: model_pass(),
-                f"{name}, behaviour": lambda learner=learner, state=posterior.state: learner._update_behavior(state.detach()),
-            }
-            for row, part in work.items():
-                rows.setdefault(row, []).extend(seconds(part, 1, device))
-    report("update", rows, options, device)
+    """Time a pre-training update (LBS) and a fine-tuning update in each format."""
+    options = parser(__doc__)
+    options.add_argument("--phases", nargs="+", default=["pre-training (LBS)", "fine-tuning"], choices=PHASES)
+    options.add_argument("--parts", action="store_true", help="time the world model's and the behaviour's half, too")
+    options = options.parse_args()
+    work: dict[str, Callable[[], object]] = {}
+    floors = {}
+    for precision in options.precision:
+        for phase in options.phases:
+            model = make_model(options, precision=precision, intrinsic_reward=PHASES[phase])
+            model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
+            learner, batch = model.learner, model.replay_buffer.sample(model.batch_size)
+            row = f"{phase}, {precision}"
+            work[row] = lambda learner=learner, batch=batch: learner.update(batch)
+            if options.parts:
+                work.update({f"{row}, {part}": half for part, half in parts(learner, batch).items()})
+            product = f"product of 4096³ in {str(learner.dtype).removeprefix('torch.')}"
+            work.setdefault(product, Product(learner.dtype, model.device))
+            if options.preset == "paper":
+                floors[row] = Floor(product, TFLOP / Product.TFLOP, TARGETS.get(precision))
+    report("update", interleaved(work, options, model.device), floors, options, model.device)
 
+
+PHASES = {"pre-training (LBS)": "lbs", "fine-tuning": None}
 
 if __name__ == "__main__":
     main()

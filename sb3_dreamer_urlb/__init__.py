@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.planning import PlannerConfig
     from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
     from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+    from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
+    from sb3_dreamer_urlb.snapshots import SnapshotError
 
 _MODULES = {
     "CnnPolicy": "policies",
@@ -26,8 +28,10 @@ _MODULES = {
     "IntrinsicReward": "intrinsic",
     "PhaseSwitchCallback": "phases",
     "PlannerConfig": "planning",
+    "RunCheckpointCallback": "run_checkpoints",
     "SequenceReplayBuffer": "replay",
     "SnapshotCallback": "phases",
+    "SnapshotError": "snapshots",
     "register_intrinsic_reward": "intrinsic",
 }
 
@@ -41,8 +45,10 @@ __all__ = [
     "IntrinsicReward",
     "PhaseSwitchCallback",
     "PlannerConfig",
+    "RunCheckpointCallback",
     "SequenceReplayBuffer",
     "SnapshotCallback",
+    "SnapshotError",
     "register_envs",
     "register_intrinsic_reward",
 ]

@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb demo|methods``, or ``python -m sb3_dreamer_urlb demo|methods``."""
+"""The command line: ``sb3-dreamer-urlb demo|methods|convert``, or ``python -m sb3_dreamer_urlb demo|methods|convert``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,42 +20,54 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     demo = commands.add_parser("demo", help="pre-train and fine-tune a small agent on walker pixels, and show the result")
     demo.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_output)")
-    demo.add_argument("--task", help="fine-tuning task, for example walker-walk")
-    demo.add_argument("--seed", type=int)
-    demo.add_argument("--pretrain-frames", type=int)
-    demo.add_argument("--finetune-frames", type=int)
-    demo.add_argument("--episodes", type=int, help="evaluation episodes")
-    demo.add_argument("--preset", help="of the model (default: small)")
     tour = commands.add_parser("methods", help="pre-train and fine-tune once with every exploration method, and print a table")
     tour.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
-    tour.add_argument("--methods", nargs="+", type=str, help="which (default: all)")
-    tour.add_argument("--task", help="default: walker-stand")
-    tour.add_argument("--seed", type=int)
-    tour.add_argument("--pretrain-frames", type=int)
-    tour.add_argument("--finetune-frames", type=int)
-    tour.add_argument("--episodes", type=int, help="evaluation episodes")
-    tour.add_argument("--preset", help="of the model (default: small)")
+    tour.add_argument("--methods", nargs="+", help="which (default: all)")
     tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
+    for run in (demo, tour):
+        run.add_argument("--task", help="for example walker-walk (default: walker-stand)")
+        run.add_argument("--seed", type=int)
+        run.add_argument("--pretrain-frames", type=int)
+        run.add_argument("--finetune-frames", type=int)
+        run.add_argument("--episodes", type=int, help="evaluation episodes")
+        run.add_argument("--preset", help="of the model (default: small)")
+    old = commands.add_parser("convert", help="rewrite a model that Stable-Baselines3 saved with pickles in the safe form")
+    old.add_argument("old", type=Path)
+    old.add_argument("new", type=Path)
+    old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
     command = options.pop("command")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Heavy imports only now, so that --help answers at once.
     try:
-        if command == "demo":
-            from sb3_dreamer_urlb.demo import DemoConfig, run_demo
-
-            run_demo(DemoConfig(**options))
-        else:
-            from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
-
-            visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
-            return int(any(visit.faults() for visit in visits))
-    except (ValueError, ImportError) as error:
+        # Heavy imports only inside, so that --help answers at once.
+        return {"demo": _demo, "methods": _methods, "convert": _convert}[command](options)
+    except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2
+
+
+def _demo(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+
+    run_demo(DemoConfig(**options))
+    return 0
+
+
+def _methods(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
+
+    visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
+    return int(any(visit.faults() for visit in visits))
+
+
+def _convert(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.snapshots.convert import convert
+
+    model = convert(**options)
+    print(f"Wrote {options['new']}: {model.phase}, {model.phase_frames} frames.")
     return 0
 
 

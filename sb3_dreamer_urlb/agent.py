@@ -80,10 +80,11 @@ class PlannedAgent:
     def __init__(self, agent: Agent, skill: th.Tensor):
         self.agent = agent
         self.skill = skill if agent.skills is not None else None
+        self._stoch_rows = agent.world_model.rssm.stoch_rows()
 
     def step(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> LatentState:
         """Sample the next state from the prior."""
-        return self.agent.world_model.rssm.prior_step(state, action, generator)
+        return self.agent.world_model.rssm.planning_step(state, action, self._stoch_rows, generator)
 
     def rewards(self, feature: th.Tensor) -> th.Tensor:
         """The reward head's mean, (…, n·M, F) → (…, n·M)."""

@@ -6,6 +6,7 @@ import inspect
 import math
 from typing import TYPE_CHECKING, Any
 
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -14,6 +15,7 @@ from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
+from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "explores",
     "planner",
     "planning",
+    "precision",
 }
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
@@ -85,6 +88,10 @@ def check(model: DreamerV2) -> None:
         value = getattr(model, name)
         if not callable(value) and not (is_finite_number(value) and value >= 0):
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+    if model.discount_head is not None and not isinstance(model.discount_head, bool):
+        raise ValueError(f"discount_head must be True, False or None, got {model.discount_head!r}.")
+    if model.action_noise is not None and not isinstance(model.action_noise, ActionNoise):
+        raise ValueError(f"action_noise must be an ActionNoise of Stable-Baselines3 or None, got {model.action_noise!r}.")
     _check_names(model)
     _check_policy_kwargs(model)
     _check_spaces(model)
@@ -93,6 +100,8 @@ def check(model: DreamerV2) -> None:
 
 
 def _check_names(model: DreamerV2) -> None:
+    if model.precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:
@@ -142,23 +151,6 @@ def check_env(model: DreamerV2, env: VecEnv) -> None:
         )
     check_for_correct_spaces(env, model.observation_space, model.action_space)
     _check_episode_fits(env, model.batch_length)
-
-
-def check_replay_buffer(model: DreamerV2, buffer: Any) -> None:
-    """Whether a loaded replay buffer belongs to a model like this.
-
-    :raises ValueError: naming what differs
-    """
-    if not isinstance(buffer, SequenceReplayBuffer):
-        raise ValueError(f"The file holds no SequenceReplayBuffer but {type(buffer).__name__}.")
-    if buffer.phase != model.phase:
-        raise ValueError(f"The replay buffer was filled in the phase {buffer.phase!r}, the model is in {model.phase!r}.")
-    for name in ("n_envs", "batch_length", "skill_size"):
-        if getattr(buffer, name) != getattr(model, name):
-            raise ValueError(f"The replay buffer has {name}={getattr(buffer, name)}, the model {getattr(model, name)}.")
-    for name in ("observation_space", "action_space"):
-        if getattr(buffer, name) != getattr(model, name):
-            raise ValueError(f"The replay buffer's {name} is {getattr(buffer, name)}, the model's {getattr(model, name)}.")
 
 
 def _check_episode_fits(env: VecEnv, batch_length: int) -> None:

@@ -41,7 +41,7 @@ class DemoConfig:
     seed: int = 0
     preset: str = "small"
     fast_render: bool = True
-    # The paper keeps the actor for walker. After two thousand frames it has learnt little but to act narrowly: fine-tuning
+    # The paper keeps the actor for walker. After three thousand frames it has learnt little but to act narrowly: fine-tuning
     # starts better with a fresh one (docs/results.md).
     keep_actor: bool | None = False
 

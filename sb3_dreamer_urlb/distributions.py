@@ -27,7 +27,8 @@ def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.
     """
     cdf = probs.cumsum(-1)
     uniform = th.rand(cdf.shape[:-1] + (1,), generator=generator, device=cdf.device, dtype=cdf.dtype)
-    return (cdf[..., :-1] <= uniform * cdf[..., -1:]).sum(-1)
+    # Rounding can make the product the whole sum, hence the bound.
+    return th.searchsorted(cdf, uniform * cdf[..., -1:], right=True).squeeze(-1).clamp_(max=cdf.shape[-1] - 1)
 
 
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
@@ -48,11 +49,15 @@ def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> 
     :return: one-hot float (…, S, K)
     """
     probs = logits.softmax(-1)
-    index = draw_classes(probs.detach(), generator)
-    one_hot = th.zeros_like(probs).scatter_(-1, index.unsqueeze(-1), 1.0)
+    one_hot = one_hot_like(probs, draw_classes(probs.detach(), generator))
     if not probs.requires_grad:
         return one_hot
     return one_hot + (probs - probs.detach())
+
+
+def one_hot_like(probs: th.Tensor, classes: th.Tensor) -> th.Tensor:
+    """Class indices (…) as one-hot vectors of the shape and format of ``probs``, (…, K)."""
+    return th.zeros_like(probs).scatter_(-1, classes.unsqueeze(-1), 1.0)
 
 
 def categorical_kl(logits_p: th.Tensor, logits_q: th.Tensor) -> th.Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-import io
-import pathlib
+import os
+from collections.abc import Iterable
+from contextlib import ExitStack
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,12 +15,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_pkl
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
-from sb3_dreamer_urlb import arguments, phases
+from sb3_dreamer_urlb import arguments, phases, run_folder
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
@@ -27,6 +27,10 @@ from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.run_folder import RunFolder
+from sb3_dreamer_urlb.snapshots import model as model_snapshot
+from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
+from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
@@ -83,6 +87,8 @@ class DreamerV2(OffPolicyAlgorithm):
     :param verbose: 0 quiet, 1 info, 2 debug
     :param seed: of everything random
     :param device: "auto", "cpu", "cuda"
+    :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
+        faster on this machine at this size; losses, statistics and weights are float32 in any case
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -139,6 +145,7 @@ class DreamerV2(OffPolicyAlgorithm):
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
+        precision: str = "auto",
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -183,6 +190,7 @@ class DreamerV2(OffPolicyAlgorithm):
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
         self.discount_head = discount_head
+        self.precision = precision
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -195,6 +203,10 @@ class DreamerV2(OffPolicyAlgorithm):
         self.action_repeat = 1
         #: of the environment's task, None where it does not tell
         self.domain: str | None = None
+        #: where the run is kept, None unless a RunCheckpointCallback does
+        self.run_folder: RunFolder | None = None
+        #: what callbacks want undone when ``learn`` ends, however it ends
+        self.during_learn = ExitStack()
 
         if _init_setup_model:
             self._setup_model()
@@ -202,14 +214,18 @@ class DreamerV2(OffPolicyAlgorithm):
     # -- set-up --------------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
+        self._prepare()
+        self.set_random_seed(self.seed)
+        self._build()
+
+    def _prepare(self) -> None:
+        """Everything of the set-up that builds nothing yet."""
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
         arguments.check(self)
         self._convert_train_freq()
         self._read_env()
-        self.set_random_seed(self.seed)
-        self._build()
 
     def _read_env(self) -> None:
         """What the environment tells about itself beyond its spaces."""
@@ -222,28 +238,38 @@ class DreamerV2(OffPolicyAlgorithm):
 
     def _build(self) -> None:
         """Fresh networks, optimisers and replay for the current phase."""
-        explores = phases.PHASES[self.phase].explores
-        intrinsic = make_intrinsic_reward(self.intrinsic_reward, self.intrinsic_kwargs)
-        if intrinsic is not None and intrinsic.skills is None and not explores:
-            intrinsic = None
+        intrinsic = self._intrinsic()
         self.skill_size = 0 if intrinsic is None or intrinsic.skills is None else intrinsic.skills.dim
         if getattr(self, "replay_buffer", None) is None:
             self.replay_buffer = self._new_replay_buffer()
-        self.policy = self.policy_class(
+        self.policy = self._new_policy().to(self.device)
+        self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
+        self.learner.updates = self.phase_updates
+        if self.verbose >= 1:
+            print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
+        self._acting_state: ActingState | None = None
+        self._metrics = MetricMeans()
+
+    def _new_policy(self) -> DreamerPolicy:
+        return self.policy_class(
             self.observation_space,
             self.action_space,
             self.lr_schedule,
             gamma=self.gamma,
             discount_head=bool(self.discount_head),
-            intrinsic=intrinsic,
-            explores=explores,
+            intrinsic=self._intrinsic(),
+            explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
+            precision=self.precision,
             **self.policy_kwargs,
-        ).to(self.device)
-        self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
-        self.learner.updates = self.phase_updates
-        self._acting_state: ActingState | None = None
-        self._metrics = MetricMeans()
+        )
+
+    def _intrinsic(self) -> IntrinsicReward | None:
+        """What the current phase explores with; fine-tuning keeps only what has skills."""
+        intrinsic = make_intrinsic_reward(self.intrinsic_reward, self.intrinsic_kwargs)
+        if intrinsic is not None and intrinsic.skills is None and not phases.PHASES[self.phase].explores:
+            return None
+        return intrinsic
 
     def _learner_config(self, intrinsic: IntrinsicReward | None) -> LearnerConfig:
         return LearnerConfig(
@@ -260,6 +286,7 @@ class DreamerV2(OffPolicyAlgorithm):
             target_update_interval=self.target_update_interval,
             ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
             reward_trains_model=not phases.PHASES[self.phase].explores,
+            precision=self.precision,
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
@@ -319,7 +346,7 @@ class DreamerV2(OffPolicyAlgorithm):
         skills = self.policy.agent.skills
         if skills is None:
             raise ValueError(f"intrinsic_reward={self.intrinsic_reward!r} has no skills.")
-        skills.fix(skills.numbered(int(skill)) if isinstance(skill, (int, np.integer)) else skill)
+        skills.fix(skills.numbered(int(skill)) if isinstance(skill, int | np.integer) else skill)
 
     def _choose_skill(self) -> None:
         """Choose the skill that serves the task best (spec/algorithms §6)."""
@@ -460,29 +487,30 @@ class DreamerV2(OffPolicyAlgorithm):
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
         """
-        total_timesteps, callbacks = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        callbacks.on_training_start(locals(), globals())
-        assert self.env is not None and isinstance(self.train_freq, TrainFreq)
-        while self.num_timesteps < total_timesteps:
-            rollout = self.collect_rollouts(
-                self.env,
-                callbacks,
-                self.train_freq,
-                self.replay_buffer,
-                self.action_noise,
-                self.learning_starts,
-                log_interval,
+        with self.during_learn:
+            total_timesteps, callbacks = self._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
             )
-            if not rollout.continue_training:
-                break
-            # SB3 gates on num_timesteps, which every learn() resets.
-            if self.phase_timesteps > self.learning_starts:
-                steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
-                self.train(steps, self.batch_size)
-        callbacks.on_training_end()
-        return self
+            callbacks.on_training_start(locals(), globals())
+            assert self.env is not None and isinstance(self.train_freq, TrainFreq)
+            while self.num_timesteps < total_timesteps:
+                rollout = self.collect_rollouts(
+                    self.env,
+                    callbacks,
+                    self.train_freq,
+                    self.replay_buffer,
+                    self.action_noise,
+                    self.learning_starts,
+                    log_interval,
+                )
+                if not rollout.continue_training:
+                    break
+                # SB3 gates on num_timesteps, which every learn() resets.
+                if self.phase_timesteps > self.learning_starts:
+                    steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
+                    self.train(steps, self.batch_size)
+            callbacks.on_training_end()
+            return self
 
     def _setup_learn(
         self,
@@ -538,53 +566,113 @@ class DreamerV2(OffPolicyAlgorithm):
 
     # -- saving --------------------------------------------------------------------------------------------------------
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "learner", "_acting_state", "_metrics"]
-
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
         return ["policy", *optimizers], []
 
+    def save(  # type: ignore[override]
+        self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """Write the model, without replay and environment, in a form that can never run code.
+
+        :param path: path (``.zip`` is added where it has no suffix; written atomically), or binary file object
+        :param exclude: part of SB3's interface; a snapshot is always whole
+        :param include: likewise
+        :raises ValueError: for ``exclude`` or ``include``, or if a weight is not finite; the old file stays
+        :raises OSError: naming the path; the old file stays
+        """
+        if exclude or include:
+            raise ValueError("A snapshot is always whole: save() takes neither exclude nor include.")
+        model_snapshot.save(self, path)
+
     @classmethod
     def load(  # type: ignore[override]
         cls: type[SelfDreamerV2],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        path: Target,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfDreamerV2:
-        """Load a snapshot; as SB3's, but an unknown keyword is an error.
+        """Read what :meth:`save` wrote. No code ever runs from a file, whoever made it.
 
-        :param path: of the ``.zip``, or a file object
+        A model with a ``seed`` goes on with the random states of the file, one without draws anew.
+
+        :param path: of the ``.zip``, or a binary file object
         :param env: environment to go on in
         :param device: where to put the networks
-        :param custom_objects: see SB3
-        :param print_system_info: see SB3
-        :param force_reset: see SB3
-        :param kwargs: constructor arguments to change
+        :param custom_objects: arguments that replace the stored ones, needed for those that no file can hold: functions as
+            learning rates, classes that are not registered; unknown names are ignored, as SB3 does
+        :param print_system_info: print those of the file and of this machine
+        :param force_reset: part of SB3's interface; the environment is always reset
+        :param kwargs: constructor arguments to change; a new ``seed`` also draws anew
         :raises TypeError: for a keyword that is no constructor argument
+        :raises SnapshotError: naming the file and why it is refused
         """
         arguments.check_load_keywords(cls, kwargs)
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        for optimizer in model.learner.optimizers().values():
-            # The loaded state carries the old settings; the arguments' are what the user asked for.
-            optimizer.restore_settings()
-        return model
+        return model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    @classmethod
+    def resume(
+        cls: type[SelfDreamerV2],
+        folder: str | os.PathLike[str],
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> SelfDreamerV2 | None:
+        """Go on with a run that a :class:`~sb3_dreamer_urlb.RunCheckpointCallback` kept, replay included.
+
+        Continue with ``learn(total - model.num_timesteps, reset_num_timesteps=False)``.
+
+        :param folder: of the run
+        :param env: environment to go on in
+        :param device: see :meth:`load`
+        :param custom_objects: see :meth:`load`
+        :param kwargs: see :meth:`load`
+        :return: the model as of the last checkpoint, random states included; None if there is none yet
+        :raises SnapshotError: naming the file and why it is refused
+        :raises RuntimeError: if the run is still going
+        """
+        arguments.check_load_keywords(cls, kwargs)
+        return run_folder.resume(
+            cls, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
+        )
+
+    def set_parameters(  # type: ignore[override]
+        self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """Take over weights and the optimisers' moments.
+
+        :param load_path_or_dict: what :meth:`save` wrote, or what :meth:`get_parameters` gave
+        :param exact_match: False takes what both have
+        :param device: part of SB3's interface; the parameters stay where they are
+        :raises SnapshotError: naming the file and why it is refused; the model stays as it is
+        """
+        if isinstance(load_path_or_dict, dict):
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        else:
+            model_snapshot.set_parameters(self, load_path_or_dict, exact_match)
+
+    def save_replay_buffer(self, path: Target) -> None:  # type: ignore[override]
+        """Write the replay, open episodes included, in a form that can never run code.
+
+        :param path: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
+        """
+        replay_snapshot.save(self.replay_buffer, path)
+
+    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
         """Go on with a saved replay buffer.
 
-        :param path: what ``save_replay_buffer`` wrote
+        :param path: what :meth:`save_replay_buffer` wrote
         :param truncate_last_traj: part of SB3's interface; open episodes are always ended
-        :raises ValueError: if it does not fit the model, or was filled in another phase; the model keeps its own then
+        :raises SnapshotError: if the file is damaged, does not fit the model, or was filled in another phase; the model
+            keeps its own then
         """
-        buffer = load_from_pkl(path, self.verbose)
-        arguments.check_replay_buffer(self, buffer)
-        buffer.device = self.device
-        buffer.close_streams()
+        buffer = self._new_replay_buffer()
+        replay_snapshot.load(buffer, path)
         self.replay_buffer = buffer
 
 

@@ -1,4 +1,4 @@
-"""One update on one batch: losses → backward → optimiser steps. The only place where parameters change.
+"""One update on one batch: losses → backward → optimiser steps. The only place that trains them.
 
 Nothing here asks the device for a value: metrics stay tensors until somebody logs them.
 """
@@ -9,12 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb import precision
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
+from sb3_dreamer_urlb.memory import keep_freed_memory
 from sb3_dreamer_urlb.optim import ClippedAdam
 from sb3_dreamer_urlb.types import LatentState, Metrics, Observation, Posterior, SequenceBatch
 
@@ -36,6 +39,7 @@ class LearnerConfig:
     target_update_interval: int
     ent_coef: float
     reward_trains_model: bool
+    precision: str = "float32"
 
 
 class Learner:
@@ -50,8 +54,12 @@ class Learner:
 
     def __init__(self, agent: Agent, config: LearnerConfig):
         self.agent = agent
+        if self.device.type == "cpu":
+            keep_freed_memory()
         self.config = config
         self.updates = 0
+        #: format of the products in the forward and backward passes; all else is float32
+        self.dtype = precision.choose(config.precision, "update", self.device, agent.world_model.sizes.feature)
         self.model_optimizer = self._optimizer(agent.world_model, config.learning_rate)
         self.actor_optimizer = self._optimizer(agent.actor, config.actor_learning_rate)
         self.critic_optimizer = self._optimizer(agent.critic, config.critic_learning_rate)
@@ -61,6 +69,15 @@ class Learner:
             self.reward_source = agent.intrinsic
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
+
+    @property
+    def device(self) -> th.device:
+        """Where the agent is."""
+        return next(self.agent.parameters()).device
+
+    def _products(self) -> th.autocast:
+        """Around every forward pass, and around nothing else: a step on a loss needs no autocast."""
+        return precision.products(self.device, self.dtype)
 
     def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
         config = self.config
@@ -85,7 +102,8 @@ class Learner:
         """
         model = self.agent.world_model
         observation = model.preprocess(batch.observation)
-        posterior = model.observe(observation, batch.action, batch.is_first)
+        with self._products():
+            posterior = model.observe(observation, batch.action, batch.is_first)
         metrics = self._update_intrinsic(_detached(posterior), batch)
         metrics.update(self._update_world_model(posterior, observation, batch))
         if self.agent.trains_behavior():
@@ -96,7 +114,8 @@ class Learner:
         return metrics
 
     def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
-        learnt = self.reward_source.loss(posterior, batch)
+        with self._products():
+            learnt = self.reward_source.loss(posterior, batch)
         if learnt is None or self.intrinsic_optimizer is None:
             return {}
         loss, metrics = learnt
@@ -107,10 +126,17 @@ class Learner:
 
     def _update_world_model(self, posterior: Posterior, observation: Observation, batch: SequenceBatch) -> Metrics:
         config = self.config
-        reward = self.reward_source.replay_reward(_detached(posterior), batch)
-        loss, metrics = self.agent.world_model.loss(
-            posterior, observation, reward, batch.is_terminal, config.free_nats, config.kl_balance, config.reward_trains_model
-        )
+        with self._products():
+            reward = self.reward_source.replay_reward(_detached(posterior), batch)
+            loss, metrics = self.agent.world_model.loss(
+                posterior,
+                observation,
+                reward,
+                batch.is_terminal,
+                config.free_nats,
+                config.kl_balance,
+                config.reward_trains_model,
+            )
         if reward is not batch.reward:
             metrics["intrinsic_replay_reward"] = reward.mean()
             metrics["intrinsic_replay_reward_std"] = reward.std()
@@ -121,7 +147,7 @@ class Learner:
         agent, config = self.agent, self.config
         start = start.flatten()
         skill = None if agent.skills is None else agent.skills.sample(start.deter.shape[0])
-        with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic):
+        with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic), self._products():
             imagination = agent.world_model.imagine(agent.actor, start, config.imagination_horizon, skill)
             raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
             reward = agent.reward_normalizer(raw_reward)
@@ -131,9 +157,10 @@ class Learner:
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
             loss = actor_critic.actor_loss(target, weight)
-            actor_grad_norm = self.actor_optimizer.step(loss)
-        value_now = agent.critic(imagination.feature[:-1].detach(), skill)
-        critic_loss = agent.critic.loss(value_now, target.detach(), weight)
+        actor_grad_norm = self.actor_optimizer.step(loss)
+        with self._products():
+            value_now = agent.critic(imagination.feature[:-1].detach(), skill)
+            critic_loss = agent.critic.loss(value_now, target.detach(), weight)
         critic_grad_norm = self.critic_optimizer.step(critic_loss)
         if self.updates % config.target_update_interval == 0:
             agent.slow_critic.load_state_dict(agent.critic.state_dict())

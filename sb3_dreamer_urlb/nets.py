@@ -9,6 +9,8 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_dreamer_urlb.precision import full
+
 
 class MLP(nn.Module):
     """ELU layers ``dense`` and one linear output ``out`` (spec/algorithms §1, "MLP 4×400 ELU").
@@ -33,7 +35,7 @@ class MLP(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """(…, inputs) → (…, outputs), or (…) for a scalar head."""
-        y = self.out(self.hidden(x))
+        y = full(self.out(self.hidden(x)))
         return y.squeeze(-1) if self.scalar else y
 
 
@@ -58,4 +60,4 @@ class ReLUNet(nn.Module):
         *hidden, last = self.dense
         for layer in hidden:
             x = F.relu(layer(x))
-        return last(x)
+        return full(last(x))

@@ -6,6 +6,7 @@ Paper §2 "Unsupervised RL" and §3 "Task-aware fine-tuning"; spec/algorithms §
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.number_checks import is_integer
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -112,19 +114,28 @@ class PhaseSwitchCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
-        if pretrain_frames < 1:
-            raise ValueError(f"pretrain_frames must be positive, got {pretrain_frames}.")
+        if not is_integer(pretrain_frames) or pretrain_frames < 1:
+            raise ValueError(f"pretrain_frames must be a positive integer, got {pretrain_frames!r}.")
         self.pretrain_frames = pretrain_frames
         self.env = env
         self.keep_actor = keep_actor
         self.keep_critic = keep_critic
 
     def _init_callback(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.intrinsic_reward is None and model.phase != PRETRAINING:
+            warnings.warn(
+                "PhaseSwitchCallback has nothing to switch: with intrinsic_reward=None the model learns the task at once."
+            )
         if self.env is None:
             return
         # Now, not after the 2M frames of pre-training.
-        model: DreamerV2 = self.model  # type: ignore[assignment]
         self.env = model.prepare_env(self.env)
+        resumed = model.run_folder is not None and model.run_folder.resumed
+        if resumed and model.phase != PRETRAINING and model.get_env() is not self.env:
+            # The run was resumed after the switch, with the pre-training's environment.
+            model.set_env(self.env)
+            model.restart_episodes()
 
     def _on_step(self) -> bool:
         return True
@@ -203,8 +214,8 @@ class SnapshotCallback(BaseCallback):
         verbose: int = 0,
     ):
         super().__init__(verbose)
-        if any(frame < 1 for frame in frames):
-            raise ValueError(f"frames must be positive, got {list(frames)}.")
+        if not isinstance(frames, Sequence) or any(not is_integer(frame) or frame < 1 for frame in frames):
+            raise ValueError(f"frames must be a sequence of positive integers, got {frames!r}.")
         self.save_path = os.fspath(save_path)
         self.frames = sorted(frames)
         self.name_prefix = name_prefix

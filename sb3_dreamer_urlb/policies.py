@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -12,17 +12,22 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_dreamer_urlb import precision as precisions
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import DynaMPC
+from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
+from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
 from sb3_dreamer_urlb.world_model.observations import DictObservations, Images, Observations, vectors
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 # Deterministic predictions draw their posterior states and planning noise from this seed, always the same.
 DETERMINISTIC_SEED = 0
+
+SelfDreamerPolicy = TypeVar("SelfDreamerPolicy", bound="DreamerPolicy")
 
 
 @dataclasses.dataclass
@@ -66,6 +71,7 @@ class DreamerPolicy(BasePolicy):
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
+    :param precision: of the planner's products, see :class:`~sb3_dreamer_urlb.DreamerV2`; all else here is float32
     :param normalize_images: False takes images of any dtype, scaled from their space's bounds instead of from [0, 255]
     :raises ValueError: for spaces or sizes that do not fit
     """
@@ -90,9 +96,12 @@ class DreamerPolicy(BasePolicy):
         explores: bool = True,
         planner: DynaMPC | None = None,
         planning: bool = True,
+        precision: str = "float32",
         normalize_images: bool = True,
     ):
         super().__init__(observation_space, action_space, normalize_images=normalize_images)
+        if net_arch is not None and not isinstance(net_arch, Sequence):
+            raise ValueError(f"policy_kwargs: net_arch must be a sequence of widths, got {net_arch!r}.")
         net_arch = [400] * 4 if net_arch is None else list(net_arch)
         sizes = {
             "deter_size": deter_size,
@@ -108,6 +117,8 @@ class DreamerPolicy(BasePolicy):
             raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
         self.observations = self._observations(observation_space, normalize_images)
         self.actions = make_actions(action_space)
+        if planner is not None and planner.classes != self.actions.classes:
+            raise ValueError(f"The planner chooses among the classes {planner.classes}, the actions are {action_space}.")
         world_model = WorldModel(
             observations=self.observations,
             action_size=self.actions.size,
@@ -120,6 +131,7 @@ class DreamerPolicy(BasePolicy):
         self.intrinsic = intrinsic
         self.planner = planner
         self.planning = planning
+        self.precision = precision
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
 
     @classmethod
@@ -139,8 +151,39 @@ class DreamerPolicy(BasePolicy):
         parameters.update(
             self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner, planning=self.planning
         )
+        parameters.update(precision=self.precision)
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
+
+    @property
+    def planner_dtype(self) -> th.dtype:
+        """Format of the planner's products."""
+        return precisions.choose(self.precision, "planner", self.device, self.agent.world_model.sizes.feature)
+
+    # -- saving --------------------------------------------------------------------------------------------------------
+
+    def save(self, path: Target) -> None:  # type: ignore[override]
+        """Write the policy, in a form that can never run code.
+
+        :param path: path, taken as it is, or binary file object
+        """
+        policy_snapshot.save(self, path)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfDreamerPolicy],
+        path: Target,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+    ) -> SelfDreamerPolicy:
+        """Read what :meth:`save` wrote.
+
+        :param path: path or binary file object
+        :param device: where to put it
+        :param custom_objects: constructor arguments that no file can hold, as an intrinsic reward that is not registered
+        :raises SnapshotError: naming the file and why it is refused
+        """
+        return policy_snapshot.load(cls, path, device, custom_objects)
 
     # -- acting --------------------------------------------------------------------------------------------------------
 
@@ -201,7 +244,8 @@ class DreamerPolicy(BasePolicy):
             action = self.actions.random(len(state.action), generator, self.device)
         elif self.planner is not None and self.planning:
             planned = PlannedAgent(self.agent, skill)
-            action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
+            with precisions.products(self.device, self.planner_dtype):
+                action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mode if deterministic else policy.sample(generator)

@@ -60,10 +60,12 @@ class LatentState:
 
     :param stoch: float (…, S·K), S one-hot vectors one after the other
     :param deter: float (…, D), the recurrent state h of the GRU
+    :param classes: the ones' places in ``stoch``, int64 (…, S); only where a planner asked for them
     """
 
     stoch: th.Tensor
     deter: th.Tensor
+    classes: th.Tensor | None = None
 
     @property
     def feature(self) -> th.Tensor:

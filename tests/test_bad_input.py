@@ -319,9 +319,9 @@ def test_an_environment_of_other_spaces(tiny_model):
 
 @pytest.mark.parametrize("frames", [0, -1])
 def test_callbacks(tmp_path, frames):
-    with pytest.raises(ValueError, match=f"pretrain_frames must be positive, got {frames}"):
+    with pytest.raises(ValueError, match=f"pretrain_frames must be a positive integer, got {frames}"):
         PhaseSwitchCallback(frames)
-    with pytest.raises(ValueError, match=rf"frames must be positive, got \[100, {frames}\]"):
+    with pytest.raises(ValueError, match=rf"frames must be a sequence of positive integers, got \[100, {frames}\]"):
         SnapshotCallback(tmp_path / "snapshots", [100, frames])
 
 

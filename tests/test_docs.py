@@ -59,6 +59,14 @@ def test_readme(small_world, tmp_path, capsys, monkeypatch):
     assert names["model"].phase == "finetuning" and names["model"].phase_timesteps >= 120
 
 
+def test_a_run_that_goes_on(small_world, tmp_path):
+    [block] = code_blocks("docs/reliability.md")
+    model = run(block, {})["model"]
+    assert model.phase == "finetuning" and model.num_timesteps >= 360
+    again = run(block.replace("1_050_000", "400"), {})["model"]
+    assert again is not model and again.num_timesteps >= 400 and again.phase_timesteps > model.phase_timesteps
+
+
 def test_an_intrinsic_reward_of_ones_own(small_world):
     [block] = [block for block in code_blocks("docs/methods.md") if "register_intrinsic_reward" in block]
     model = run(block, {"env": gymnasium.make("walker")})["model"]
@@ -79,6 +87,6 @@ def test_cartpole(monkeypatch):
 
 
 def test_every_local_link_leads_somewhere():
-    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+    for page in (ROOT / "README.md", ROOT / "SECURITY.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"

@@ -15,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import DreamerV2
@@ -270,7 +271,7 @@ def test_equal_seeds_give_equal_weights(tiny_model, weights, method):
 @pytest.mark.parametrize("as_file", [True, False])
 @pytest.mark.parametrize("method", ["lbs", None])
 def test_save_and_load(tiny_model, weights, tmp_path, method, as_file):
-    model = tiny_model(vec_env(2, 8), intrinsic_reward=method, planner="dyna_mpc", learning_rate=lambda left: 1e-3 * left)
+    model = tiny_model(vec_env(2, 8), intrinsic_reward=method, planner="dyna_mpc", learning_rate=LinearSchedule(1e-3, 0, 1))
     model.learn(40)
     target = io.BytesIO() if as_file else tmp_path / "model"
     model.save(target)

@@ -20,6 +20,7 @@ from sb3_dreamer_urlb.intrinsic import (
     APT,
     DIAYN,
     RND,
+    OneHotSkills,
     Plan2Explore,
     RewardSource,
     make_intrinsic_reward,
@@ -348,6 +349,7 @@ def test_an_instance_is_a_template(tiny_model):
         ("apd", None, r"Unknown intrinsic_reward 'apd'; known are .*'aps', 'apt'.*None"),
         ("apt", {"neighbours": 3}, r"Unknown intrinsic_kwargs \['neighbours'\] for 'apt'; known are \['k'\]"),
         (None, {"k": 3}, r"intrinsic_kwargs=\{'k': 3\} need the name or the class"),
+        ("apt", ["k"], r"intrinsic_kwargs must be a dictionary or None, got \['k'\]"),
         ("diayn", {"skill_dim": 1}, "skill_dim must be an integer of at least 2, got 1"),
         ("aps", {"skill_dim": 1}, "skill_dim must be an integer of at least 2, got 1"),
         ("diayn", {"skill_interval": 0}, "skill_interval must be an integer of at least 1, got 0"),
@@ -374,3 +376,13 @@ def test_the_papers_hyperparameters():
     momenta = {name: method.momentum for name, method in registered_intrinsic_rewards().items() if name in METHODS}
     assert {name for name, momentum in momenta.items() if momentum == 1.0} == {"rnd", "aps"}
     assert set(momenta.values()) == {0.95, 1.0} and DIAYN.ent_coef == 0.1 and APS.ent_coef == 0.0
+
+
+def test_skills_belong_to_a_skill_reward(tiny_model):
+    class Half(IntrinsicReward):
+        def __init__(self):
+            super().__init__()
+            self.skills = OneHotSkills(3)
+
+    with pytest.raises(ValueError, match="Half has skills, so it must be a subclass of SkillReward"):
+        tiny_model(CounterEnv(8), intrinsic_reward=Half)

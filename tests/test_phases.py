@@ -298,7 +298,8 @@ def test_a_switch_is_found_again_by_repeated_learns_and_after_loading(tiny_model
 
 
 def test_a_switch_does_nothing_to_a_run_without_pretraining(tiny_model):
-    model = tiny_model(vec_env()).learn(40, callback=PhaseSwitchCallback(8))
+    with pytest.warns(UserWarning, match="nothing to switch: with intrinsic_reward=None"):
+        model = tiny_model(vec_env()).learn(40, callback=PhaseSwitchCallback(8))
     assert model.phase_timesteps == 40
 
 
@@ -417,3 +418,9 @@ def test_a_snapshot_is_fine_tuned_by_the_papers_flow(tiny_model, tmp_path):
     model.learn(40)
     assert model._planner_is_on() and model.phase_updates > 0
     assert all(th.isfinite(value).all() for value in model.policy.state_dict().values())
+
+
+@pytest.mark.parametrize("frames", [100, [0], ["5"]])
+def test_bad_frames_of_snapshots(frames, tmp_path):
+    with pytest.raises(ValueError, match="sequence of positive integers"):
+        SnapshotCallback(tmp_path, frames)

@@ -194,7 +194,7 @@ def test_replay_refuses_skills_of_another_size(skilled, tiny_model, tmp_path):
             *[np.zeros((1, 3, 16, 16), np.uint8)] * 2, np.zeros((1, 2)), [0.0], [False], [{}], np.ones((1, 9))
         )
     model.save_replay_buffer(tmp_path / "replay")
-    with pytest.raises(ValueError, match="skill_size"):
+    with pytest.raises(ValueError, match="skill"):
         tiny_model(CounterEnv(8), intrinsic_reward="lbs").load_replay_buffer(tmp_path / "replay")
 
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_dreamer_urlb.types import Posterior
+from sb3_dreamer_urlb.types import LatentState, Posterior
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, deconvolution_kernels
 from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
 from sb3_dreamer_urlb.world_model.observations import Images
@@ -243,3 +243,17 @@ def test_imagination(learner):
     assert th.allclose(imagination.entropy[2], expected)
     (gradient,) = th.autograd.grad(imagination.feature[-1].square().sum(), [agent.actor.body.out.weight])
     assert gradient.abs().sum() > 0
+
+
+def test_planning_step_is_the_prior_step(world_model):
+    """One after the other with the same draws: the first state is any, the others carry their classes."""
+    rssm = world_model().rssm
+    ours = theirs = LatentState(th.rand(6, rssm.stoch_size), th.randn(6, rssm.deter_size))
+    with th.no_grad():
+        for step in range(4):
+            action, generators = th.rand(6, 2), [th.Generator().manual_seed(step) for _ in range(2)]
+            ours = rssm.planning_step(ours, action, rssm.stoch_rows(), generators[0])
+            theirs = rssm.prior_step(theirs, action, generators[1])
+            assert theirs.classes is None and ours.classes.shape == (6, 3)
+            assert th.equal(ours.stoch, theirs.stoch) and th.allclose(ours.deter, theirs.deter, atol=1e-6)
+            assert th.equal(ours.stoch.gather(1, ours.classes), th.ones(6, 3)) and ours.stoch.sum() == 18

@@ -10,6 +10,7 @@ from torch import nn
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
 from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import Imagination, Metrics
 
 MIN_STD = 0.1
@@ -33,8 +34,8 @@ class Actor(nn.Module):
     def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal:
         """(…, F) and the skill followed there, (…, W), → distribution over (…, A)."""
         hidden = self.body.hidden(_with_skill(feature, skill))
-        std = 2 * th.sigmoid(self.out_std(hidden) / 2) + MIN_STD
-        return BoundedNormal(th.tanh(self.body.out(hidden)), std)
+        std = 2 * th.sigmoid(full(self.out_std(hidden)) / 2) + MIN_STD
+        return BoundedNormal(th.tanh(full(self.body.out(hidden))), std)
 
 
 class CategoricalActor(MLP):

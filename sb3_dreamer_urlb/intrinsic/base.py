@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch as th
 from torch import nn
@@ -72,6 +73,16 @@ class IntrinsicReward(RewardSource):
     trains_actor: ClassVar[bool] = True
     #: the critic learns successor features ψ with value = ψ · w instead of values (APS)
     successor_features: ClassVar[bool] = False
+
+    #: what the constructor was called with, for files
+    constructor_kwargs: dict[str, Any]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        self = super().__new__(cls)
+        given = inspect.signature(cls.__init__).bind_partial(self, *args, **kwargs).arguments
+        # A copy is made without arguments, and gets them with everything else.
+        self.__dict__["constructor_kwargs"] = dict(list(given.items())[1:])
+        return self
 
     def __init__(self) -> None:
         super().__init__()

@@ -137,7 +137,8 @@ class _Search:
         """
         squares = self.left.new_empty(len(rows), max(self.n, self.groups * _GROUP))
         squares[:, self.n :] = th.inf
-        th.mm(self.left[rows], self.right, out=squares[:, : self.n])
+        with th.autocast(squares.device.type, enabled=False):  # in bfloat16 it would find the wrong particles
+            th.mm(self.left[rows], self.right, out=squares[:, : self.n])
         squares.scatter_(1, rows[:, None], -th.inf)
         nearest, candidates = self._smallest(squares) if self.groups else squares.topk(self.count, largest=False)
         # with particles that are not finite the padding may be chosen

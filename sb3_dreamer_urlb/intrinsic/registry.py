@@ -7,6 +7,7 @@ import inspect
 from typing import Any
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 
 _REGISTRY: dict[str, type[IntrinsicReward]] = {}
 
@@ -49,13 +50,15 @@ def make_intrinsic_reward(
     :param kwargs: hyperparameters for a name or a class
     :raises ValueError: for an unknown name, unknown or unfit hyperparameters, or anything else that is no intrinsic reward
     """
+    if kwargs is not None and not isinstance(kwargs, dict):
+        raise ValueError(f"intrinsic_kwargs must be a dictionary or None, got {kwargs!r}.")
     kwargs = kwargs or {}
     if kwargs and (method is None or isinstance(method, IntrinsicReward)):
         raise ValueError(f"intrinsic_kwargs={kwargs} need the name or the class of a method, got intrinsic_reward={method!r}.")
     if method is None:
         return None
     if isinstance(method, IntrinsicReward):
-        return copy.deepcopy(method)
+        return _checked(copy.deepcopy(method))
     chosen = get_intrinsic_reward(method) if isinstance(method, str) else method
     if not (isinstance(chosen, type) and issubclass(chosen, IntrinsicReward)):
         raise ValueError(
@@ -65,4 +68,10 @@ def make_intrinsic_reward(
     unknown = sorted(set(kwargs) - known)
     if unknown:
         raise ValueError(f"Unknown intrinsic_kwargs {unknown} for {method!r}; known are {sorted(known)}.")
-    return chosen(**kwargs)
+    return _checked(chosen(**kwargs))
+
+
+def _checked(made: IntrinsicReward) -> IntrinsicReward:
+    if made.skills is not None and not isinstance(made, SkillReward):
+        raise ValueError(f"{type(made).__qualname__} has skills, so it must be a subclass of SkillReward, which chooses one.")
+    return made

@@ -66,6 +66,8 @@ class Skills(nn.Module):
             self.fixed.zero_()
             self.is_fixed = False
             return
+        if not isinstance(skill, th.Tensor | np.ndarray | list | tuple):
+            raise ValueError(f"A skill must be a vector of {self.dim} numbers, got {skill!r}.")
         skill = th.as_tensor(skill, dtype=self.fixed.dtype, device=self.fixed.device)
         if skill.shape != (self.dim,):
             raise ValueError(f"A skill must have the shape ({self.dim},), got {tuple(skill.shape)}.")

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.types import SequenceBatch
 
 RawObservation = np.ndarray | dict[str, np.ndarray]
@@ -34,7 +35,7 @@ class Episode:
         capacity = 128
         seen = observation_columns(observation)
         #: rows of each column, the first ``length`` of them filled
-        self.columns = {
+        self.columns: dict[str, np.ndarray] = {
             **{name: np.empty((capacity, *value.shape), value.dtype) for name, value in seen.items()},
             "action": np.zeros((capacity, action_size), np.float32),
             "reward": np.zeros(capacity, np.float32),
@@ -43,6 +44,16 @@ class Episode:
         }
         self.length = 0
         self._put({**seen, "skill": skill})
+
+    @classmethod
+    def of(cls, columns: dict[str, np.ndarray]) -> Episode:
+        """A finished episode of given rows, for example from a file.
+
+        :param columns: rows of each of ``SequenceReplayBuffer.columns``
+        """
+        episode = cls.__new__(cls)
+        episode.columns, episode.length = columns, len(columns["reward"])
+        return episode
 
     def __len__(self) -> int:
         return self.length
@@ -113,11 +124,9 @@ def observation_of(columns: dict[str, np.ndarray]) -> RawObservation:
     return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}
 
 
-def _row(observation: RawObservation, i: int) -> RawObservation:
-    """The observation of environment ``i``."""
-    if isinstance(observation, dict):
-        return {name: part[i] for name, part in observation.items()}
-    return np.asarray(observation[i])
+def _zeros(space: spaces.Space) -> np.ndarray:
+    assert space.shape is not None
+    return np.zeros(space.shape, space.dtype)
 
 
 class SequenceReplayBuffer(ReplayBuffer):
@@ -174,6 +183,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.finished_rows = 0
         self.finished_count = 0
         self.longest = 0
+        #: episodes that went; episode i of those held is number ``evicted + i`` of all
+        self.evicted = 0
 
     def size(self) -> int:
         """Rows held, those of open episodes included."""
@@ -208,11 +219,19 @@ class SequenceReplayBuffer(ReplayBuffer):
         for i in range(self.n_envs):
             episode = self.open[i]
             if episode is None:
-                episode = self.open[i] = Episode(_row(obs, i), action[i].size, skill[i])
+                episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i])
             terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
-            episode.append(_row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i])
+            episode.append(self._row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i])
             if done[i] or len(episode) >= self.max_episode_rows:
                 self._finish(i)
+
+    def _row(self, observation: RawObservation, i: int) -> RawObservation:
+        """The observation of environment ``i``, in the types that its space declares, whatever the environment gives."""
+        space = self.observation_space
+        if isinstance(observation, dict):
+            assert isinstance(space, spaces.Dict)
+            return {name: np.asarray(part[i], space[name].dtype) for name, part in observation.items()}
+        return np.asarray(observation[i], space.dtype)
 
     def close_streams(self) -> None:
         """End the open episodes as truncated: the environments were reset behind their back."""
@@ -229,8 +248,20 @@ class SequenceReplayBuffer(ReplayBuffer):
             return
         self.episodes.append(episode.finish())
         self.finished_rows += len(episode)
+        self.evict()
+
+    def evict(self) -> None:
+        """Let the oldest episodes go until ``buffer_size`` is kept."""
         while self.finished_rows > self.buffer_size and len(self.episodes) > 1:
             self.finished_rows -= len(self.episodes.popleft())
+            self.evicted += 1
+
+    def columns(self) -> dict[str, tuple[th.dtype, tuple[int, ...]]]:
+        """What a row of an episode consists of: name → type and shape, for files."""
+        space = self.observation_space
+        first = {name: _zeros(part) for name, part in space.items()} if isinstance(space, spaces.Dict) else _zeros(space)
+        episode = Episode(first, make_actions(self.action_space).size, np.zeros(self.skill_size, np.float32))
+        return {name: (th.from_numpy(rows[:0]).dtype, rows.shape[1:]) for name, rows in episode.columns.items()}
 
     # -- reading -------------------------------------------------------------------------------------------------------
 

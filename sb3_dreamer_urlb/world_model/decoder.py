@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.world_model.convolution import convolve
 
 
 def deconvolution_kernels(size: int) -> list[int]:
@@ -60,8 +62,9 @@ class ConvDecoder(nn.Module):
         """
         x = F.elu(self._grow(self.input(feature.flatten(0, -2))))
         for deconv in self.deconvs[1:]:
-            x = F.elu(deconv(x))
-        return x.reshape(feature.shape[:-1] + x.shape[1:])
+            assert isinstance(deconv, nn.ConvTranspose2d)
+            x = F.elu(convolve(deconv, x))
+        return full(x).reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:
         """The first transposed convolution: on a 1×1 map it is a plain matrix product, which is faster."""
@@ -69,7 +72,7 @@ class ConvDecoder(nn.Module):
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
         y = (x @ first.weight.view(channels, -1)).view(-1, out, height, width)
-        return y + first.bias.view(1, -1, 1, 1)
+        return y + first.bias.to(y.dtype).view(1, -1, 1, 1)
 
 
 class VectorDecoder(MLP):

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.world_model.convolution import convolve
 
 KERNEL, STRIDE = 4, 2
 
@@ -49,8 +51,9 @@ class ConvEncoder(Encoder):
         # Channels last is a third faster on CPU, from small to paper size.
         x = image.flatten(0, -4).contiguous(memory_format=th.channels_last)
         for conv in self.convs:
-            x = self.activation(conv(x))
-        return x.reshape(image.shape[:-3] + (self.embed_size,))
+            assert isinstance(conv, nn.Conv2d)
+            x = self.activation(convolve(conv, x))
+        return full(x).reshape(image.shape[:-3] + (self.embed_size,))
 
 
 class VectorEncoder(MLP, Encoder):

@@ -91,8 +91,8 @@ class Images(Observations):
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
-        image = raw.to(th.float32)
-        return (image if self.low == 0 else image - self.low) / self.range - 0.5
+        image = raw if raw.dtype == th.uint8 else raw.to(th.float32)
+        return th.div(image if self.low == 0 else image - self.low, self.range).sub_(0.5)
 
     def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
         return ConvEncoder(self.shape, cnn_depth)

@@ -1,0 +1,208 @@
+"""Runs that go on after kill -9: a folder with the last checkpoint, and the way back.
+
+``snapshot.zip`` is the checkpoint. It names the files of ``replay/`` that belong to it, so a checkpoint is: write the new
+episodes, write the snapshot, rename it, and only then remove what no snapshot names any more (spec/reliability "Resume").
+A kill at any point leaves the checkpoint before or the one after.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from sb3_dreamer_urlb.snapshots import model as model_snapshot
+from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
+from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming
+from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+    from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+Model = TypeVar("Model", bound="DreamerV2")
+
+SNAPSHOT, REPLAY, LOCK = "snapshot.zip", "replay", "lock"
+FIELDS = {"number", "segments", "open", "evicted", "finished_count", "longest", "evaluation"}
+
+
+@dataclass
+class Segment:
+    """A file of finished episodes.
+
+    :param name: in the folder ``replay``
+    :param end: number of the episode after its last, counted over the whole phase
+    """
+
+    name: str
+    end: int
+
+
+class RunFolder:
+    """One run on disk, as of its last checkpoint.
+
+    :param path: of the folder
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        self.number = 0
+        self.segments: list[Segment] = []
+        self.identity: tuple[int, int, int] | None = None
+        #: what the evaluation was like when a resumed run was left, until somebody takes it
+        self.evaluation: dict[str, Any] | None = None
+        self.resumed = False
+        self._buffer: weakref.ref[SequenceReplayBuffer] | None = None
+
+    @property
+    def snapshot(self) -> Path:
+        """The checkpoint."""
+        return self.path / SNAPSHOT
+
+    def is_current(self) -> bool:
+        """Whether the checkpoint on disk is the one that this object wrote or read."""
+        return self.identity == _identity(self.snapshot)
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def save(self, model: DreamerV2, evaluation: dict[str, Any] | None = None) -> None:
+        """Write a checkpoint; only what is new of the replay.
+
+        :param model: between two rollouts, if it is to go on bit for bit
+        :param evaluation: what to remember of the evaluation, JSON
+        :raises OSError: naming the path; the last checkpoint stays
+        """
+        buffer, number = model.replay_buffer, self.number + 1
+        # Another phase has another replay.
+        mine = self._buffer is not None and self._buffer() is buffer
+        segments = [segment for segment in self.segments if mine and segment.end > buffer.evicted]
+        written = segments[-1].end if segments else 0
+        new = [episode for i, episode in enumerate(buffer.episodes, buffer.evicted) if i >= written]
+        if new:
+            segments.append(Segment(f"{number:06d}.zip", buffer.evicted + len(buffer.episodes)))
+            replay_snapshot.write(buffer, self.path / REPLAY / segments[-1].name, new)
+        open_ = [episode for episode in buffer.open if episode is not None]
+        open_name = f"{number:06d}-open.zip" if open_ else None
+        if open_name is not None:
+            replay_snapshot.write(buffer, self.path / REPLAY / open_name, open_)
+        run = {
+            "number": number,
+            "segments": [[segment.name, segment.end] for segment in segments],
+            "open": open_name,
+            "evicted": buffer.evicted,
+            "finished_count": buffer.finished_count,
+            "longest": buffer.longest,
+            "evaluation": evaluation,
+        }
+        model_snapshot.save(model, self.snapshot, run)
+        self.number, self.segments, self._buffer = number, segments, weakref.ref(buffer)
+        self.identity = _identity(self.snapshot)
+        self._remove_unnamed(open_name)
+
+    def _remove_unnamed(self, open_name: str | None) -> None:
+        named = {open_name, *(segment.name for segment in self.segments)}
+        folder = self.path / REPLAY
+        for file in folder.iterdir() if folder.is_dir() else ():
+            if file.name not in named:
+                file.unlink()
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other runs out.
+
+        :raises RuntimeError: if another process, or another run of this one, is in the folder
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with open(self.path / LOCK, "a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise RuntimeError(f"Another run (process {file.read().strip() or '?'}) is in {self.path}.") from None
+            file.seek(0)
+            file.truncate()
+            file.write(f"{os.getpid()}\n")
+            file.flush()
+            # What a killed run left half-written.
+            for leftover in self.path.glob(f".*{TEMPORARY}"):
+                leftover.unlink()
+            yield
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    def restore(self, model: DreamerV2, run: Any) -> None:
+        """Fill the replay of a model that was loaded from this folder's checkpoint.
+
+        :param model: with an empty replay
+        :param run: what :meth:`save` put into the checkpoint
+        :raises SnapshotError: naming the file and why it is refused
+        """
+        with blaming(str(self.snapshot)):
+            if not isinstance(run, dict) or set(run) != FIELDS:
+                raise ValueError("it was not saved in a run folder")
+            self.number = int(run["number"])
+            self.segments = [Segment(_plain_name(name), int(end)) for name, end in run["segments"]]
+            open_name = None if run["open"] is None else _plain_name(run["open"])
+            numbers = {name: int(run[name]) for name in ("evicted", "finished_count", "longest")}
+            if run["evaluation"] is not None:
+                best, calls = run["evaluation"]["best_mean_reward"], run["evaluation"]["n_calls"]
+                self.evaluation = {"best_mean_reward": float(best), "n_calls": int(calls)}
+        buffer = model.replay_buffer
+        folder = self.path / REPLAY
+        episodes = [e for segment in self.segments for e in replay_snapshot.load_some(buffer, folder / segment.name)]
+        open_ = [] if open_name is None else replay_snapshot.load_some(buffer, folder / open_name)
+        first = self.segments[-1].end - len(episodes) if self.segments else numbers["evicted"]
+        if first > numbers["evicted"]:
+            raise SnapshotError(f"{folder} lacks episodes that {self.snapshot} names.")
+        replay_snapshot.restore(buffer, episodes[numbers["evicted"] - first :], open_, numbers)
+        self._buffer, self.identity = weakref.ref(buffer), _identity(self.snapshot)
+        self.resumed = True
+
+
+def _identity(path: Path) -> tuple[int, int, int] | None:
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _plain_name(name: Any) -> str:
+    if not isinstance(name, str) or Path(name).name != name or not name.endswith(".zip"):
+        raise ValueError(f"it names the replay file {str(name)[:80]!r}")
+    return name
+
+
+def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **kwargs: Any) -> Model | None:
+    """Go on with a run.
+
+    :param algorithm: class of the model
+    :param folder: of the run
+    :param env: environment to go on in
+    :param kwargs: of :func:`sb3_dreamer_urlb.snapshots.model.load`
+    :return: the model with its replay; None if there is no checkpoint yet
+    :raises NotADirectoryError: for a file
+    """
+    if os.path.isfile(folder):
+        raise NotADirectoryError(
+            f"resume() takes the folder of a run, got the file {os.fspath(folder)!r}: DreamerV2.load reads it."
+        )
+    run_folder = RunFolder(folder)
+    if not run_folder.snapshot.exists():
+        return None
+    with run_folder.locked():
+        model, run = model_snapshot.load(algorithm, run_folder.snapshot, env, resume=True, **kwargs)
+        run_folder.restore(model, run)
+    model.run_folder = run_folder
+    if model.env is not None and model.seed is not None:
+        # The run's own seed would bring the first episodes' resets back.
+        sequence = np.random.SeedSequence([model.seed, model.num_timesteps])
+        model.env.seed(int(sequence.generate_state(1)[0]) >> 1)
+    return model

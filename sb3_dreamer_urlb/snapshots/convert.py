@@ -1,0 +1,36 @@
+"""Stable-Baselines3's own form of a DreamerV2 (a zip with pickles) → a safe snapshot. Loading a pickle can run any code."""
+
+from __future__ import annotations
+
+import os
+import warnings
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.snapshots.archive import blaming
+from sb3_dreamer_urlb.snapshots.atomic import path_to_read
+
+
+def convert(old: str | os.PathLike[str], new: str | os.PathLike[str], trust: bool) -> DreamerV2:
+    """Read a file of the old form and write it in the new.
+
+    :param old: what Stable-Baselines3's ``save`` wrote
+    :param new: path to write
+    :param trust: whoever made ``old`` may run code on this machine
+    :return: the converted model
+    :raises ValueError: without ``trust``, or if it is no such file
+    """
+    if not trust:
+        raise ValueError(
+            f"Loading {os.fspath(old)} can run any code that its maker put in. If you trust where it comes from, add --trust."
+        )
+    path = path_to_read(old, "zip")
+    with warnings.catch_warnings(), blaming(str(path)):
+        warnings.simplefilter("ignore")
+        # DreamerV2's own load is the safe one.
+        model: DreamerV2 = BaseAlgorithm.load.__func__(DreamerV2, path, device="cpu")  # type: ignore[attr-defined]
+    for optimizer in model.learner.optimizers().values():
+        optimizer.restore_settings()
+    model.save(new)
+    return model

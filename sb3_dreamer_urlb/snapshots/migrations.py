@@ -1,0 +1,31 @@
+"""What older files lack: one step a version, each tested with a file of the older form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+#: of the files written now; goes up with every change that older code could not read
+VERSION = 2
+
+
+def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Version 2 added what a run needs to go on: random states, statistics of the last episodes, the run's folder."""
+    if kind == "model":
+        return {**data, "random": None, "episodes": [], "run": None}
+    return data
+
+
+MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1}
+
+
+def migrate(kind: str, data: dict[str, Any], version: int) -> dict[str, Any]:
+    """Bring ``data`` of an older file to the present form.
+
+    :param kind: of the file
+    :param data: its JSON
+    :param version: its version, at most ``VERSION``
+    """
+    for older in range(version, VERSION):
+        data = MIGRATIONS[older](kind, data)
+    return data

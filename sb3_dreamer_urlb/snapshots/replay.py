@@ -1,0 +1,170 @@
+"""Replayed episodes ↔ a file: columns of rows as safetensors, in members that fit into memory many times.
+
+Each ``rows-…`` member holds whole episodes: their lengths and, one after the other, the rows of each column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import safetensors.numpy
+
+from sb3_dreamer_urlb.replay.sequence_buffer import Episode
+from sb3_dreamer_urlb.snapshots import tensors, values
+from sb3_dreamer_urlb.snapshots.archive import Archive, Target, reading, writing
+from sb3_dreamer_urlb.snapshots.random_state import generator_state, set_generator
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+KIND = "replay"
+#: bytes that a member should have; one long episode may exceed it
+MEMBER_BYTES = 64 << 20
+LENGTHS = "lengths"
+NUMBERS = ("n_envs", "batch_length", "evicted", "finished_count", "longest")
+FIELDS = {*NUMBERS, "observation_space", "action_space", "phase", "sampler", "streams"}
+
+
+def save(buffer: SequenceReplayBuffer, target: Target) -> None:
+    """Write a whole replay buffer.
+
+    :param buffer: open episodes are stored, too
+    :param target: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
+    """
+    write(buffer, target, [*buffer.episodes, *(episode for episode in buffer.open if episode is not None)])
+
+
+def write(buffer: SequenceReplayBuffer, target: Target, episodes: Iterable[Episode]) -> None:
+    """Write some episodes of a buffer.
+
+    :param buffer: describes them
+    :param target: see :func:`save`
+    :param episodes: in their order
+    """
+    with writing(target, KIND, suffix="pkl") as writer:
+        for number, group in enumerate(_groups(episodes)):
+            writer.add(f"rows-{number:06d}.safetensors", _pack(buffer, group))
+        writer.finish(
+            {
+                **{name: int(getattr(buffer, name)) for name in NUMBERS},
+                "observation_space": values.encode(buffer.observation_space),
+                "action_space": values.encode(buffer.action_space),
+                "phase": buffer.phase,
+                "sampler": generator_state(buffer.rng),
+                # which environment each open episode, the last of them all, belongs to
+                "streams": [i for i, episode in enumerate(buffer.open) if episode is not None],
+            }
+        )
+
+
+def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
+    group: list[Episode] = []
+    size = 0
+    for episode in episodes:
+        group.append(episode)
+        size += len(episode) * sum(rows[0].nbytes for rows in episode.columns.values())
+        if size >= MEMBER_BYTES:
+            yield group
+            group, size = [], 0
+    if group:
+        yield group
+
+
+def _pack(buffer: SequenceReplayBuffer, group: list[Episode]) -> bytes:
+    columns = {name: np.concatenate([e.columns[name][: len(e)] for e in group]) for name in buffer.columns()}
+    columns[LENGTHS] = np.array([len(episode) for episode in group], np.int64)
+    return safetensors.numpy.save(columns)
+
+
+# -- loading ---------------------------------------------------------------------------------------------------------------
+
+
+def load(buffer: SequenceReplayBuffer, source: Target) -> None:
+    """Fill an empty buffer from a file; open episodes come back ended as truncated.
+
+    :param buffer: of the model that is to go on with it; unusable if this raises
+    :param source: path or binary file object
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    with reading(source, KIND, suffix="pkl") as archive:
+        data = _checked_data(buffer, archive)
+        episodes = list(_episodes(buffer, archive))
+        count = len(data["streams"])
+        if count > len(episodes):
+            raise ValueError("it has fewer episodes than environments with an open one")
+        finished = episodes[: len(episodes) - count]
+        restore(buffer, finished, episodes[len(finished) :], data)
+        set_generator(buffer.rng, data["sampler"])
+
+
+def load_some(buffer: SequenceReplayBuffer, source: Target) -> list[Episode]:
+    """The episodes of one file of a run folder.
+
+    :param buffer: that they must fit
+    :param source: path
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    with reading(source, KIND) as archive:
+        _checked_data(buffer, archive)
+        return list(_episodes(buffer, archive))
+
+
+def restore(buffer: SequenceReplayBuffer, finished: list[Episode], open_: list[Episode], numbers: dict[str, Any]) -> None:
+    """Put episodes into an empty buffer as if it had lived through them.
+
+    :param buffer: empty
+    :param finished: finished episodes
+    :param open_: open ones, which end here as truncated
+    :param numbers: its counters
+    """
+    buffer.episodes.extend(finished)
+    buffer.finished_rows = sum(map(len, finished))
+    for name in ("evicted", "finished_count", "longest"):
+        setattr(buffer, name, numbers[name])
+    for episode in open_:
+        buffer.open[0] = episode
+        buffer.close_streams()
+    buffer.evict()
+
+
+def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, Any]:
+    data = archive.data
+    if set(data) != FIELDS:
+        raise ValueError("it has other fields than it should")
+    for name in NUMBERS:
+        if type(data[name]) is not int or not 0 <= data[name] < 2**62:
+            raise ValueError(f"its {name} is {str(data[name])[:80]!r}")
+    streams = data["streams"]
+    if not isinstance(streams, list) or len(streams) > data["n_envs"]:
+        raise ValueError("its list of open episodes is damaged")
+    if data["phase"] != buffer.phase:
+        raise ValueError(
+            f"the replay buffer was filled in the phase {str(data['phase'])[:80]!r}, the model is in {buffer.phase!r}"
+        )
+    for name in ("n_envs", "batch_length"):
+        if data[name] != getattr(buffer, name):
+            raise ValueError(f"the replay buffer has {name}={data[name]}, the model {getattr(buffer, name)}")
+    for name in ("observation_space", "action_space"):
+        space = values.decode(data[name])
+        if space != getattr(buffer, name):
+            raise ValueError(f"the replay buffer's {name} is {space}, the model's {getattr(buffer, name)}")
+    return data
+
+
+def _episodes(buffer: SequenceReplayBuffer, archive: Archive) -> Iterator[Episode]:
+    columns = buffer.columns()
+    for member in archive.rows():
+        table = tensors.read_table(archive, member)
+        rows = table.get("reward", ("", (0,)))[1][:1]
+        count = table.get(LENGTHS, ("", (0,)))[1][:1]
+        expected = {name: (tensors.DTYPES[dtype], (*rows, *shape)) for name, (dtype, shape) in columns.items()}
+        tensors.compare(table, {**expected, LENGTHS: ("I64", count)})
+        loaded = tensors.unpack(archive, member)
+        lengths = loaded.pop(LENGTHS)
+        if int(lengths.sum()) != rows[0] or bool((lengths < 1).any()) or bool((lengths > buffer.max_episode_rows).any()):
+            raise ValueError(f"the lengths of {member} are damaged")
+        for part in zip(*(loaded[name].split(lengths.tolist()) for name in columns), strict=True):
+            # Copies, so that an evicted episode gives its memory back.
+            yield Episode.of({name: np.array(rows.numpy()) for name, rows in zip(columns, part, strict=True)})

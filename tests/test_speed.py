@@ -1,0 +1,102 @@
+"""A guard against slow-downs that needs no clock: operator calls of one update and one planned action, at tiny size.
+
+The bounds are the counts of today plus a tenth. Who needs more calls raises a bound in the same commit and says why; who
+saves some lowers it. Counted with a TorchDispatchMode: everything below autograd, views included, forward and backward.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+
+import pytest
+import torch as th
+from test_behavior import SYNCHRONISING
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_dreamer_urlb.agent import PlannedAgent
+from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
+
+# Operator calls by what runs; T = 5 and H = 3 in an update, H = 3 and J = 2 in a plan.
+BOUNDS = {
+    ("update", None, "float32"): 1750,
+    ("update", "lbs", "float32"): 1810,
+    ("update", "lbs", "bfloat16"): 2140,
+    ("plan", None, "float32"): 625,
+    ("plan", None, "bfloat16"): 735,
+}
+PLANNER = PlannerConfig(horizon=3, n_samples=8, iterations=2, top_k=4, mixture=0.25)
+
+
+class Calls(TorchDispatchMode):
+    """Counts operator calls by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.counts[str(func)] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def work(learner, batch):
+    """Make a function that does one update or plans one action."""
+
+    def make(what, intrinsic, precision):
+        its = learner(intrinsic, precision=precision)
+        if what == "update":
+            return lambda: its.update(batch)
+        state, planner = its.agent.world_model.rssm.initial(2), DynaMPC(PLANNER, 0.95)
+        mean = th.zeros(2, PLANNER.horizon, its.agent.actor.action_size)
+
+        def plan():
+            with th.no_grad(), its._products():
+                return planner.plan(PlannedAgent(its.agent, th.zeros(2, 0)), state, mean, None, explore=True)
+
+        return plan
+
+    return make
+
+
+@pytest.mark.parametrize("case", BOUNDS, ids=str)
+def test_operator_calls_stay_below_their_bound(work, case):
+    run = work(*case)
+    run()  # optimisers make their state
+    with Calls() as calls:
+        run()
+    total = calls.counts.total()
+    most = calls.counts.most_common(15)
+    assert total <= BOUNDS[case], f"{case}: {total} operator calls, the bound is {BOUNDS[case]}: {most}"
+    # A bound that nothing comes near guards nothing.
+    assert total > 0.8 * BOUNDS[case], f"{case}: only {total} operator calls, lower the bound of {BOUNDS[case]}"
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_planning_never_asks_the_device_for_a_value(work, monkeypatch, precision):
+    plan = work("plan", None, precision)
+    plan()  # anything that torch sets up once
+
+    def refuse(*_, **__):
+        raise AssertionError("planning waited for the device")
+
+    with contextlib.ExitStack() as stack:
+        for name in SYNCHRONISING:
+            stack.enter_context(pytest.MonkeyPatch.context()).setattr(th.Tensor, name, refuse)
+        with pytest.raises(AssertionError, match="waited"):
+            bool(th.ones(()))
+        action, mean = plan()
+    assert action.shape == (2, 2) and mean.shape == (2, 3, 2)
+
+
+@pytest.mark.parametrize("what", ["update", "plan"])
+def test_one_more_operator_is_noticed(work, what):
+    """The counter sees what it should: the forward and the backward pass, and each operator once."""
+    x = th.ones(3, requires_grad=True)
+    with Calls() as calls:
+        (x * x).sum().backward()
+    assert calls.counts["aten.mul.Tensor"] >= 2 and calls.counts["aten.sum.default"] == 1
+    with Calls() as calls:
+        work(what, None, "float32")()
+    assert calls.counts.total() > 100
