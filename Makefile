@@ -25,7 +25,7 @@ export PYTHON TORCH_INDEX VENV
 ONE_THREAD := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} LP_NUM_THREADS=$${LP_NUM_THREADS:-0}
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-gl demo test test-slow format lint type bench golden constraints clean clean-venv
+.PHONY: help setup setup-gl demo test test-slow faults format lint type bench golden constraints clean clean-venv
 
 help:  ## list the targets
 	@echo "make TARGET, where TARGET is one of"
@@ -39,6 +39,9 @@ test: setup-gl  ## set up, then run the tests but the slow ones (PYTEST_ARGS, PY
 
 test-slow: setup-gl  ## run the long learning checks, one after the other (PYTEST_ARGS)
 	$(BIN)/python -m pytest -m slow --timeout=0 $(PYTEST_ARGS)
+
+faults: setup-gl  ## inject faults for some minutes: kills, damaged files, dying workers; ends with a table (PYTEST_ARGS)
+	$(ONE_THREAD) $(BIN)/python tests/faults.py $(PYTEST_ARGS)
 
 format: setup  ## sort imports and format the code
 	$(BIN)/ruff check --select I --fix $(SOURCES)

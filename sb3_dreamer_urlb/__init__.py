@@ -13,6 +13,7 @@ from sb3_dreamer_urlb.envs import register_envs
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
     from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
+    from sb3_dreamer_urlb.numerical_faults import NumericalFaultError
     from sb3_dreamer_urlb.phases import FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
     from sb3_dreamer_urlb.planning import PlannerConfig
     from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
@@ -26,6 +27,7 @@ _MODULES = {
     "DreamerV2": "dreamer_v2",
     "FineTuneCallback": "phases",
     "IntrinsicReward": "intrinsic",
+    "NumericalFaultError": "numerical_faults",
     "PhaseSwitchCallback": "phases",
     "PlannerConfig": "planning",
     "RunCheckpointCallback": "run_checkpoints",
@@ -43,6 +45,7 @@ __all__ = [
     "DreamerV2",
     "FineTuneCallback",
     "IntrinsicReward",
+    "NumericalFaultError",
     "PhaseSwitchCallback",
     "PlannerConfig",
     "RunCheckpointCallback",

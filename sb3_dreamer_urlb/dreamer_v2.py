@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -19,8 +20,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
-from sb3_dreamer_urlb import arguments, phases, run_folder
+from sb3_dreamer_urlb import arguments, env_steps, numerical_faults, phases, run_folder
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.envs.faults import check_finite_action
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
@@ -201,10 +203,14 @@ class DreamerV2(OffPolicyAlgorithm):
         self.phase_frames = 0
         #: environment frames an agent step
         self.action_repeat = 1
+        #: faults that environments' guards reported so far
+        self.env_faults = 0
         #: of the environment's task, None where it does not tell
         self.domain: str | None = None
         #: where the run is kept, None unless a RunCheckpointCallback does
         self.run_folder: RunFolder | None = None
+        #: writes a checkpoint of the run now and returns its folder; None unless a RunCheckpointCallback is at work
+        self.checkpoint: Callable[[], Path] | None = None
         #: what callbacks want undone when ``learn`` ends, however it ends
         self.during_learn = ExitStack()
 
@@ -223,6 +229,10 @@ class DreamerV2(OffPolicyAlgorithm):
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        path = self.replay_buffer_kwargs.get("path")
+        if isinstance(path, os.PathLike):
+            # As snapshots can hold it.
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
         arguments.check(self)
         self._convert_train_freq()
         self._read_env()
@@ -424,6 +434,7 @@ class DreamerV2(OffPolicyAlgorithm):
                 scaled = state.action.cpu().numpy()
         if action_noise is not None:
             scaled = np.clip(scaled + action_noise().reshape(n_envs, -1), -1, 1)
+        check_finite_action(scaled, "The policy", self.num_timesteps)
         scaled = scaled.astype(np.float32)
         state.action = th.as_tensor(scaled, device=self.device)
         self._acting_state = state
@@ -446,16 +457,13 @@ class DreamerV2(OffPolicyAlgorithm):
             self._last_original_obs, original_obs = self._last_obs, new_obs  # type: ignore[assignment]
         else:
             original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
-        if not np.isfinite(reward).all():
-            bad = int(np.flatnonzero(~np.isfinite(reward))[0])
-            raise ValueError(
-                f"Environment {bad} gave the reward {reward[bad]} at step {self.num_timesteps}; expected a finite one."
-            )
+        self.env_faults += env_steps.count_faults(infos)
         # The VecEnv has already begun the next episode: put the true last observation back.
         next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
             if (last := infos[i].get("terminal_observation")) is not None:
                 _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
+        env_steps.check_finite(next_obs, reward, self.num_timesteps)
         assert self._acting_state is not None
         skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
@@ -533,6 +541,7 @@ class DreamerV2(OffPolicyAlgorithm):
 
         :param gradient_steps: number of updates
         :param batch_size: B
+        :raises NumericalFaultError: if losses or gradients stay non-finite; the last good state is saved then
         """
         if not self.replay_buffer.can_sample():
             arguments.check_episode_length(self.replay_buffer)
@@ -546,6 +555,7 @@ class DreamerV2(OffPolicyAlgorithm):
             self._metrics.add(self.learner.update(batch))
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
+        numerical_faults.stop_if_repeated(self)
 
     def _set_learning_rates(self) -> None:
         # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.
@@ -560,6 +570,8 @@ class DreamerV2(OffPolicyAlgorithm):
         """Write the log; the only place where metrics leave the device."""
         for name, value in self._metrics.take().items():
             self.logger.record(f"train/{name}", value)
+        self.logger.record("train/skipped_updates", self.learner.guard.total())
+        self.logger.record("rollout/env_faults", self.env_faults)
         self.logger.record("time/phase", self.phase, exclude="tensorboard")
         self.logger.record("time/phase_frames", self.phase_frames)
         super().dump_logs()

@@ -18,6 +18,7 @@ from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.memory import keep_freed_memory
+from sb3_dreamer_urlb.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.optim import ClippedAdam
 from sb3_dreamer_urlb.types import LatentState, Metrics, Observation, Posterior, SequenceBatch
 
@@ -69,6 +70,7 @@ class Learner:
             self.reward_source = agent.intrinsic
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
+        self.guard = UpdateGuard(agent, self.optimizers())
 
     @property
     def device(self) -> th.device:
@@ -95,11 +97,15 @@ class Learner:
         return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
 
     def update(self, batch: SequenceBatch) -> Metrics:
-        """Learn from one batch.
+        """Learn from one batch; parts whose loss or gradient is not finite do not.
 
         :param batch: (B, T, …) on the agent's device
         :return: metrics, detached scalars on the device
         """
+        with self.guard.watching():
+            return self._update(batch)
+
+    def _update(self, batch: SequenceBatch) -> Metrics:
         model = self.agent.world_model
         observation = model.preprocess(batch.observation)
         with self._products():

@@ -27,6 +27,8 @@ class ClippedAdam:
         self.eps = eps
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
+        #: whether the last step was skipped, bool scalar on the device; whoever wants to know sets it to None before
+        self.skipped: th.Tensor | None = None
         self.adam = th.optim.AdamW(self.parameters, lr=learning_rate, eps=eps, weight_decay=0.0, fused=True)
         self.set_learning_rate(learning_rate)
 
@@ -41,6 +43,8 @@ class ClippedAdam:
     def step(self, loss: th.Tensor) -> th.Tensor:
         """Descend ``loss``; other parameters in its graph receive no gradient.
 
+        A loss or gradient that is not finite changes nothing, neither weights nor moments. That is decided on the device.
+
         :param loss: scalar
         :return: the gradient's global norm before the bound, a detached scalar
         """
@@ -49,6 +53,9 @@ class ClippedAdam:
             # Fused Adam reads raw memory: a gradient laid out channels-last would be applied to the wrong weights.
             parameter.grad = grad.contiguous()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        self.skipped = ~(norm.isfinite() & loss.detach().isfinite())
+        # What torch's gradient scaler tells fused Adam by.
+        self.adam.found_inf = self.skipped.float()  # type: ignore[attr-defined]
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         return norm

@@ -66,6 +66,8 @@ class RunCheckpointCallback(BaseCallback):
                 "for a new run choose another folder."
             )
         model.run_folder = self.run = run
+        model.checkpoint = self._checkpoint
+        model.during_learn.callback(setattr, model, "checkpoint", None)
         self._saved = None if run.identity is None else self._state()
         self.received = None
         if self.evaluation is not None and run.evaluation is not None:
@@ -109,6 +111,10 @@ class RunCheckpointCallback(BaseCallback):
             raise KeyboardInterrupt
         if self.received is not None:
             raise SystemExit(128 + self.received)
+
+    def _checkpoint(self) -> Path:
+        self._save()
+        return self.folder
 
     def _save(self) -> None:
         evaluation = None

@@ -84,7 +84,11 @@ class RunFolder:
         mine = self._buffer is not None and self._buffer() is buffer
         segments = [segment for segment in self.segments if mine and segment.end > buffer.evicted]
         written = segments[-1].end if segments else 0
-        new = [episode for i, episode in enumerate(buffer.episodes, buffer.evicted) if i >= written]
+        # A store on disk keeps its own rows: only how far it had come.
+        buffer.attach()
+        stored = None if buffer.disk is None else buffer.evicted + len(buffer.episodes)
+        held = buffer.episodes if stored is None else ()
+        new = [episode for i, episode in enumerate(held, buffer.evicted) if i >= written]
         if new:
             segments.append(Segment(f"{number:06d}.zip", buffer.evicted + len(buffer.episodes)))
             replay_snapshot.write(buffer, self.path / REPLAY / segments[-1].name, new)
@@ -100,6 +104,7 @@ class RunFolder:
             "finished_count": buffer.finished_count,
             "longest": buffer.longest,
             "evaluation": evaluation,
+            **({} if stored is None else {"stored": stored}),
         }
         model_snapshot.save(model, self.snapshot, run)
         self.number, self.segments, self._buffer = number, segments, weakref.ref(buffer)
@@ -145,8 +150,11 @@ class RunFolder:
         :raises SnapshotError: naming the file and why it is refused
         """
         with blaming(str(self.snapshot)):
-            if not isinstance(run, dict) or set(run) != FIELDS:
+            if not isinstance(run, dict) or set(run) - {"stored"} != FIELDS:
                 raise ValueError("it was not saved in a run folder")
+            if ("stored" in run) != (model.replay_buffer.path is not None):
+                raise ValueError("its replay is kept in another store")
+            stored = int(run.get("stored", 0))
             self.number = int(run["number"])
             self.segments = [Segment(_plain_name(name), int(end)) for name, end in run["segments"]]
             open_name = None if run["open"] is None else _plain_name(run["open"])
@@ -156,12 +164,21 @@ class RunFolder:
                 self.evaluation = {"best_mean_reward": float(best), "n_calls": int(calls)}
         buffer = model.replay_buffer
         folder = self.path / REPLAY
+        if buffer.path is not None:
+            buffer.attach(taking_over=True)
+            buffer.roll_back(stored, numbers)
+            replay_snapshot.close(buffer, [] if open_name is None else replay_snapshot.load_some(buffer, folder / open_name))
+            self._restored(buffer)
+            return
         episodes = [e for segment in self.segments for e in replay_snapshot.load_some(buffer, folder / segment.name)]
         open_ = [] if open_name is None else replay_snapshot.load_some(buffer, folder / open_name)
         first = self.segments[-1].end - len(episodes) if self.segments else numbers["evicted"]
         if first > numbers["evicted"]:
             raise SnapshotError(f"{folder} lacks episodes that {self.snapshot} names.")
         replay_snapshot.restore(buffer, episodes[numbers["evicted"] - first :], open_, numbers)
+        self._restored(buffer)
+
+    def _restored(self, buffer: SequenceReplayBuffer) -> None:
         self._buffer, self.identity = weakref.ref(buffer), _identity(self.snapshot)
         self.resumed = True
 

@@ -307,7 +307,7 @@ def test_a_long_episode_among_short_ones_is_enough(tiny_model):
 def test_a_reward_that_is_no_number(tiny_model, reward):
     envs = [CounterEnv(50), CounterEnv(50, rewards=[0.0, 0.0, 0.0, reward])]
     model = tiny_model(DummyVecEnv([lambda i=i: envs[i] for i in range(2)]))
-    with pytest.raises(ValueError, match=f"Environment 1 gave the reward {reward} at step 8; expected a finite one"):
+    with pytest.raises(ValueError, match=f"Environment 1, step 8: the reward is {reward}; expected finite numbers"):
         model.learn(40)
     assert model.replay_buffer.size() == 2 * 4  # the bad row was not stored
 

@@ -11,7 +11,8 @@ import pytest
 from fake_envs import CounterEnv
 from gymnasium import spaces
 
-from sb3_dreamer_urlb import dreamer_v2
+from sb3_dreamer_urlb import dreamer_v2, envs
+from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
@@ -60,11 +61,22 @@ def test_readme(small_world, tmp_path, capsys, monkeypatch):
 
 
 def test_a_run_that_goes_on(small_world, tmp_path):
-    [block] = code_blocks("docs/reliability.md")
+    block, *_ = code_blocks("docs/reliability.md")
     model = run(block, {})["model"]
     assert model.phase == "finetuning" and model.num_timesteps >= 360
     again = run(block.replace("1_050_000", "400"), {})["model"]
     assert again is not model and again.num_timesteps >= 400 and again.phase_timesteps > model.phase_timesteps
+
+
+def test_guards_and_a_replay_on_disk(small_world, tmp_path, monkeypatch):
+    _, guards, disk = code_blocks("docs/reliability.md")
+    asked = []
+    monkeypatch.setattr(supervisor, "make_vec_env", lambda *args, **kwargs: asked.append((args, kwargs)))
+    names = run(guards.replace("env = make_supervised", "other = make_supervised"), {"gymnasium": gymnasium})
+    assert asked == [(("urlb/walker-run-v0", 4), {"vec_env_cls": envs.SupervisedVecEnv})]
+    assert isinstance(names["env"], envs.FaultGuard)
+    model = run(disk, {"DreamerV2": dreamer_v2.DreamerV2, "env": names["env"]})["model"].learn(80)
+    assert model.replay_buffer.can_sample() and (tmp_path / "runs" / "walker-replay" / "finetuning" / "data.mdb").exists()
 
 
 def test_an_intrinsic_reward_of_ones_own(small_world):

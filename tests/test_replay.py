@@ -99,9 +99,11 @@ def check_rows(batch, ends=None):
         assert np.array_equal(batch.is_terminal.numpy(), terminal)
 
 
-def test_trap():
+@pytest.mark.parametrize("store", ["memory", "lmdb"])
+def test_trap(store, tmp_path):
     rng = np.random.default_rng(1)
-    streams = Streams(make_buffer(), lambda _: (int(rng.integers(1, 121)), rng.choice(["terminal", "truncated"])))
+    buffer = make_buffer(**({} if store == "memory" else {"store": store, "path": tmp_path}))
+    streams = Streams(buffer, lambda _: (int(rng.integers(1, 121)), rng.choice(["terminal", "truncated"])))
     for step in range(3 * 1500):  # three rows a step: nine times round
         streams.step()
         if step % 500 == 400:

@@ -138,6 +138,28 @@ def test_the_replay_holds_the_types_that_the_space_declares():
     assert expected["observation/b"] == (th.int64, ()) and expected["action"] == (th.float32, (6,))
 
 
+@pytest.mark.parametrize("name", ["dict", "odd names", "discrete", "depth"])
+def test_a_replay_on_disk_holds_and_draws_the_same(tmp_path, name):
+    space = KINDS[name][1]
+    kwargs = {"batch_length": 3, "seed": 0, "n_envs": 1}
+    on_disk = {"store": "lmdb", "path": tmp_path / "disk"}
+    memory, disk = (SequenceReplayBuffer(100, space, ACTIONS["table"], "cpu", **kwargs, **more) for more in ({}, on_disk))
+    space.seed(0)
+    for t in range(40):
+        seen = space.sample()
+        seen = (
+            {key: np.asarray(part)[None] for key, part in seen.items()} if isinstance(seen, dict) else np.asarray(seen)[None]
+        )
+        for buffer in (memory, disk):
+            buffer.add(seen, seen, np.full((1, 11), t), np.full(1, t), np.array([t % 7 == 0]), [{}])
+    for mine, its in zip(memory.episodes, disk.episodes, strict=True):
+        mine, its = mine.rows(0, len(mine)), its.rows(0, len(its))
+        assert mine.keys() == its.keys() and all(mine[key].tobytes() == its[key].tobytes() for key in mine)
+    mine, its = (buffer.sample(20).observation for buffer in (memory, disk))
+    parts = [(mine[key], its[key]) for key in space] if isinstance(space, spaces.Dict) else [(mine, its)]
+    assert all(a.dtype == b.dtype and th.equal(a, b) for a, b in parts)
+
+
 @pytest.mark.parametrize("kernel", [4, (1, 4), (3, 2)])
 @pytest.mark.parametrize("kind", [nn.Conv2d, nn.ConvTranspose2d])
 @pytest.mark.parametrize("shape", [(4, 9), (9, 4), (4, 4)])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import pytest
@@ -17,10 +18,13 @@ import torch as th
 import yaml
 from fake_envs import CounterEnv
 from gymnasium.envs.registration import EnvSpec
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
-from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, env_id
+from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
 from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.zoo import registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
 
@@ -328,3 +332,11 @@ def test_snapshots_need_a_run(tiny_model, tmp_path, monkeypatch):
     callbacks = [RunSnapshotCallback(frames=[8]), PhaseSwitchCallback(8)]
     tiny_model(intrinsic_reward="lbs").learn(16, callback=callbacks)
     assert not list(tmp_path.iterdir())
+
+
+def test_processes_are_supervised():
+    registration.register()
+    for given, used in ((SubprocVecEnv, SupervisedVecEnv), (DummyVecEnv, DummyVecEnv)):
+        manager = SimpleNamespace(vec_env_class=given)
+        assert registration._create_envs(lambda its, n: (its.vec_env_class, n), manager, 3) == (used, 3)
+    assert hasattr(ExperimentManager.create_envs, "_of_dreamer_v2")

@@ -6,8 +6,12 @@ stream, so episodes may end at different times; only finished episodes are drawn
 
 from __future__ import annotations
 
+import math
+import os
+import warnings
 from collections import deque
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -16,7 +20,12 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.env_steps import is_fault
+from sb3_dreamer_urlb.replay import stores
 from sb3_dreamer_urlb.types import SequenceBatch
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.replay.lmdb_store import LmdbStore
 
 RawObservation = np.ndarray | dict[str, np.ndarray]
 #: column of an observation, or of the part of a Dict observation whose name follows
@@ -92,6 +101,10 @@ class Episode:
         seen = observation_columns(observation)
         self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
 
+    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Some rows of every column, by name; no copies."""
+        return {name: part[start:stop] for name, part in self.columns.items()}
+
     def finish(self) -> Episode:
         """Give unused memory back."""
         self._resize(self.length)
@@ -130,7 +143,7 @@ def _zeros(space: spaces.Space) -> np.ndarray:
 
 
 class SequenceReplayBuffer(ReplayBuffer):
-    """In-memory replay of episodes, one stream per environment.
+    """Replay of episodes, one stream per environment; finished ones in memory or on disk.
 
     Memory is taken as episodes arrive. When more than ``buffer_size`` rows are held, whole episodes go, oldest first.
 
@@ -144,6 +157,12 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param seed: of the sampler
     :param phase: name of the phase that filled it; a fine-tuning refuses a pre-training's buffer
     :param skill_size: W, size of the skills to store with each row, 0 for none
+    :param store: ``"memory"``, or ``"lmdb"`` for a file that survives the process (``pip install
+        'sb3_dreamer_urlb[lmdb]'``); open episodes are in memory in any case
+    :param path: folder of the file; each phase has its own in it. Rows that an earlier run left there are taken over
+    :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
+    :raises ValueError: for arguments that do not fit
+    :raises ModuleNotFoundError: if lmdb is not installed
     """
 
     def __init__(
@@ -159,6 +178,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         seed: int | None = None,
         phase: str = "",
         skill_size: int = 0,
+        store: str = "memory",
+        path: str | os.PathLike[str] | None = None,
+        map_size: int | None = None,
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -174,11 +196,27 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.phase = phase
         self.skill_size = skill_size
         self.rng = np.random.default_rng(seed)
-        self.reset()
+        stores.check_store(store, path, map_size)
+        self.disk: LmdbStore | None = None
+        self.path = None if path is None else Path(path) / (phase or "replay")
+        self.map_size = map_size
+        stores.warn_if_too_large(buffer_size, self.row_bytes(), self.path)
+        self._reset_memory()
+
+    def row_bytes(self) -> int:
+        """Bytes of one row."""
+        return sum(dtype.itemsize * math.prod(shape) for dtype, shape in self.columns().values())
 
     def reset(self) -> None:
-        """Forget everything."""
-        self.episodes: deque[Episode] = deque()
+        """Forget everything, also on disk."""
+        self._reset_memory()
+        if self.path is not None:
+            self.attach(taking_over=True)
+            self.roll_back(0, {"finished_count": 0, "longest": 0})
+
+    def _reset_memory(self) -> None:
+        #: finished episodes, oldest first
+        self.episodes: Any = deque() if self.disk is None else self.disk
         self.open: list[Episode | None] = [None] * self.n_envs
         self.finished_rows = 0
         self.finished_count = 0
@@ -186,8 +224,42 @@ class SequenceReplayBuffer(ReplayBuffer):
         #: episodes that went; episode i of those held is number ``evicted + i`` of all
         self.evicted = 0
 
+    def attach(self, taking_over: bool = False) -> None:
+        """Open the store on disk, if there is to be one. Not before it is needed: who only looks at a model leaves it alone.
+
+        :param taking_over: the rows of an earlier run are expected
+        :raises ReplayStoreError: if it cannot be used
+        """
+        if self.path is None or self.disk is not None:
+            return
+        from sb3_dreamer_urlb.replay.lmdb_store import SPARE, LmdbStore
+
+        # 1.3: pages that are not full.
+        map_size = self.map_size or int(1.3 * (self.buffer_size + self.max_episode_rows) * self.row_bytes()) + SPARE
+        layout = {name: (th.empty(0, dtype=dtype).numpy().dtype, shape) for name, (dtype, shape) in self.columns().items()}
+        self.episodes = self.disk = LmdbStore(self.path, layout, {"phase": self.phase}, map_size)
+        self._follow_disk()
+        if self.finished_rows and not taking_over:
+            warnings.warn(f"{self.path} holds {self.finished_rows} rows of an earlier run: they will be drawn, too.")
+
+    def _follow_disk(self) -> None:
+        assert self.disk is not None
+        self.evicted, self.finished_rows = self.disk.first, sum(self.disk.lengths)
+        self.finished_count, self.longest = self.disk.counters["finished_count"], self.disk.counters["longest"]
+
+    def roll_back(self, end: int, counters: dict[str, int]) -> None:
+        """Forget what came to the store on disk after a checkpoint.
+
+        :param end: number of the first episode that goes
+        :param counters: ``finished_count`` and ``longest`` as of the checkpoint
+        """
+        assert self.disk is not None
+        self.disk.roll_back(end, {name: counters[name] for name in ("finished_count", "longest")})
+        self._follow_disk()
+
     def size(self) -> int:
         """Rows held, those of open episodes included."""
+        self.attach()
         return self.finished_rows + sum(len(episode) for episode in self.open if episode is not None)
 
     # -- writing -------------------------------------------------------------------------------------------------------
@@ -209,14 +281,19 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param action: as executed, in [-1, 1] or one-hot, (n_envs, A)
         :param reward: (n_envs,)
         :param done: (n_envs,)
-        :param infos: ``TimeLimit.truncated`` tells truncation from termination
+        :param infos: ``TimeLimit.truncated`` tells truncation from termination; a step marked as a fault is not stored, and
+            ends the episode before it as truncated
         :param skill: that each action followed, (n_envs, W); None without skills
         :raises ValueError: for skills of another shape
         """
+        self.attach()
         skill = np.zeros((self.n_envs, 0), np.float32) if skill is None else skill
         if skill.shape != (self.n_envs, self.skill_size):
             raise ValueError(f"Skills must have the shape {(self.n_envs, self.skill_size)}, got {skill.shape}.")
         for i in range(self.n_envs):
+            if is_fault(infos[i]):
+                self._finish(i)
+                continue
             episode = self.open[i]
             if episode is None:
                 episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i])
@@ -246,9 +323,22 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.longest = max(self.longest, len(episode))
         if len(episode) < self.batch_length:
             return
-        self.episodes.append(episode.finish())
-        self.finished_rows += len(episode)
-        self.evict()
+        if self.disk is None:
+            self.episodes.append(episode.finish())
+            self.finished_rows += len(episode)
+            self.evict()
+        else:
+            self._write(episode)
+
+    def _write(self, episode: Episode) -> None:
+        """To the disk, together with what has to go for it."""
+        assert self.disk is not None
+        leaving, rows = 0, self.finished_rows + len(episode)
+        while rows > self.buffer_size and leaving < len(self.disk):
+            rows -= self.disk.lengths[leaving]
+            leaving += 1
+        self.disk.change(episode, leaving, {"finished_count": self.finished_count, "longest": self.longest})
+        self._follow_disk()
 
     def evict(self) -> None:
         """Let the oldest episodes go until ``buffer_size`` is kept."""
@@ -267,6 +357,7 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def can_sample(self) -> bool:
         """Whether any finished episode is long enough."""
+        self.attach()
         return len(self.episodes) > 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceBatch:  # type: ignore[override]
@@ -282,13 +373,13 @@ class SequenceReplayBuffer(ReplayBuffer):
         length = self.batch_length
         columns = {
             name: np.empty((batch_size, length, *rows.shape[1:]), rows.dtype)
-            for name, rows in self.episodes[0].columns.items()
+            for name, rows in self.episodes[0].rows(0, 1).items()
         }
         for b, index in enumerate(self.rng.integers(len(self.episodes), size=batch_size)):
             episode = self.episodes[index]
             start = self.rng.integers(len(episode) - length + 1)
-            for name, rows in episode.columns.items():
-                columns[name][b] = rows[start : start + length]
+            for name, rows in episode.rows(start, start + length).items():
+                columns[name][b] = rows
         is_first = np.zeros((batch_size, length), bool)
         is_first[:, 0] = True
         observation = self._normalize_obs(observation_of(columns), env)

@@ -64,7 +64,7 @@ def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
     size = 0
     for episode in episodes:
         group.append(episode)
-        size += len(episode) * sum(rows[0].nbytes for rows in episode.columns.values())
+        size += len(episode) * sum(rows.nbytes for rows in episode.rows(0, 1).values())
         if size >= MEMBER_BYTES:
             yield group
             group, size = [], 0
@@ -73,7 +73,8 @@ def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
 
 
 def _pack(buffer: SequenceReplayBuffer, group: list[Episode]) -> bytes:
-    columns = {name: np.concatenate([e.columns[name][: len(e)] for e in group]) for name in buffer.columns()}
+    rows = [episode.rows(0, len(episode)) for episode in group]
+    columns = {name: np.concatenate([part[name] for part in rows]) for name in buffer.columns()}
     columns[LENGTHS] = np.array([len(episode) for episode in group], np.int64)
     return safetensors.numpy.save(columns)
 
@@ -89,6 +90,8 @@ def load(buffer: SequenceReplayBuffer, source: Target) -> None:
     :raises SnapshotError: naming the file and why it is refused
     """
     with reading(source, KIND, suffix="pkl") as archive:
+        if buffer.path is not None:
+            raise ValueError(f"the model keeps its replay on disk, in {buffer.path}, and takes no other")
         data = _checked_data(buffer, archive)
         episodes = list(_episodes(buffer, archive))
         count = len(data["streams"])
@@ -123,10 +126,19 @@ def restore(buffer: SequenceReplayBuffer, finished: list[Episode], open_: list[E
     buffer.finished_rows = sum(map(len, finished))
     for name in ("evicted", "finished_count", "longest"):
         setattr(buffer, name, numbers[name])
+    close(buffer, open_)
+    buffer.evict()
+
+
+def close(buffer: SequenceReplayBuffer, open_: list[Episode]) -> None:
+    """Put episodes that were open at its end, as truncated.
+
+    :param buffer: with no open ones of its own
+    :param open_: in their order
+    """
     for episode in open_:
         buffer.open[0] = episode
         buffer.close_streams()
-    buffer.evict()
 
 
 def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, Any]:

@@ -14,9 +14,10 @@ from typing import Any
 from unittest import mock
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
 from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
@@ -70,6 +71,13 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     return original(manager)
 
 
+def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> VecEnv:
+    """``--vec-env subproc`` survives processes that die or hang."""
+    if manager.vec_env_class is SubprocVecEnv:
+        manager.vec_env_class = SupervisedVecEnv
+    return original(manager, *args, **kwargs)
+
+
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
     """Tell the snapshots their folder, whose number rl_zoo3 chooses; let each trial of ``-optimize`` stop at NaN."""
     original(manager)
@@ -117,6 +125,7 @@ def _load_fitting_buffer(
 
 _AROUND: dict[str, Callable[..., Any]] = {
     "read_hyperparameters": _read_hyperparameters,
+    "create_envs": _create_envs,
     "create_callbacks": _create_callbacks,
     "_load_pretrained_agent": _load_pretrained_agent,
 }

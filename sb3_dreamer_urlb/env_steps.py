@@ -1,0 +1,39 @@
+"""What an algorithm makes of the steps of its environments that went wrong (spec/reliability "Long runs")."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_dreamer_urlb.envs.faults import FAULT, FAULTS, what_is_not_finite
+
+
+def count_faults(infos: list[dict[str, Any]]) -> int:
+    """Faults that guards reported with a step of all environments."""
+    return sum(int(info.get(FAULTS, 0)) for info in infos)
+
+
+def is_fault(info: dict[str, Any]) -> bool:
+    """Whether a step did not happen: its row must not be stored, the episode ends before it."""
+    return FAULT in info
+
+
+def check_finite(observation: Any, reward: np.ndarray, step: int) -> None:
+    """Refuse numbers that are none, where no guard caught them.
+
+    :param observation: (n_envs, …), or such by name
+    :param reward: (n_envs,)
+    :param step: for the message
+    :raises ValueError: naming the environment, the step and what is wrong
+    """
+    if what_is_not_finite(observation, reward) is None:
+        return
+    for i in range(len(reward)):
+        mine = {name: part[i] for name, part in observation.items()} if isinstance(observation, dict) else observation[i]
+        reason = what_is_not_finite(mine, reward[i])
+        if reason is not None:
+            raise ValueError(
+                f"Environment {i}, step {step}: {reason}; expected finite numbers. To end such episodes and go on, "
+                "wrap it in sb3_dreamer_urlb.envs.FaultGuard."
+            )

@@ -1,0 +1,116 @@
+"""Updates whose loss or gradient is not finite: skipped, counted, and the end of a run where they do not stop.
+
+The optimisers decide on the device whether they step (:class:`~sb3_dreamer_urlb.optim.ClippedAdam`); here are the counts, and
+the statistics that a bad batch must not spoil either. Only :meth:`UpdateGuard.repeated` and :meth:`UpdateGuard.total` wait
+for the device (spec/reliability "Long runs").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch as th
+
+from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.optim import ClippedAdam
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+#: skipped updates in a row that end a run; looked at every so many updates
+MAX_IN_A_ROW = 20
+
+
+class NumericalFaultError(ValueError):
+    """Losses or gradients stayed non-finite. A ValueError, on which rl_zoo3's ``-optimize`` prunes the trial."""
+
+
+class UpdateGuard:
+    """Counts the updates that were skipped, and keeps running statistics finite.
+
+    :param agent: whose statistics to keep
+    :param optimizers: of its parts, by name
+    """
+
+    def __init__(self, agent: Agent, optimizers: dict[str, ClippedAdam]):
+        self.agent = agent
+        self.optimizers = optimizers
+        device = next(agent.parameters()).device
+        #: which parts' steps the last update skipped, in the order of ``optimizers``
+        self.skipped = th.zeros(len(optimizers), dtype=th.bool, device=device)
+        self._good = th.zeros((), dtype=th.bool, device=device)
+        self._in_a_row = th.zeros((), dtype=th.int64, device=device)
+        self._total = th.zeros((), dtype=th.int64, device=device)
+        self._since_check = 0
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Around an update."""
+        for optimizer in self.optimizers.values():
+            optimizer.skipped = None
+        statistics = self._statistics()
+        before = [value.clone() for value in statistics]
+        yield
+        # All or none: a mean must not stay behind its count.
+        finite = th.stack([value.isfinite().all() for value in statistics]).all()
+        for value, old in zip(statistics, before, strict=True):
+            value.copy_(th.where(finite, value, old))
+        # A part that had nothing to learn skipped nothing.
+        flags = [self._good if o.skipped is None else o.skipped for o in self.optimizers.values()]
+        self.skipped = th.stack(flags)
+        bad = self.skipped.any()
+        self._in_a_row = (self._in_a_row + 1) * bad
+        self._total = self._total + bad
+        self._since_check += 1
+
+    def _statistics(self) -> list[th.Tensor]:
+        """What updates change without an optimiser."""
+        modules = [self.agent.reward_normalizer, *([] if self.agent.intrinsic is None else [self.agent.intrinsic])]
+        return [value for module in modules for value in module.buffers() if value.is_floating_point()]
+
+    def repeated(self) -> list[str]:
+        """The parts that kept the last ``MAX_IN_A_ROW`` updates from being learnt; looks only every so many updates."""
+        if self._since_check < MAX_IN_A_ROW:
+            return []
+        self._since_check = 0
+        if int(self._in_a_row) < MAX_IN_A_ROW:
+            return []
+        return [name for name, skipped in zip(self.optimizers, self.skipped.tolist(), strict=True) if skipped]
+
+    def total(self) -> int:
+        """Skipped updates so far."""
+        return int(self._total)
+
+
+def stop_if_repeated(model: DreamerV2) -> None:
+    """End a run that no longer learns, after a last snapshot: the weights are those of the last good update.
+
+    :param model: after its updates
+    :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts and the snapshot
+    """
+    parts = [name.removesuffix("_optimizer") for name in model.learner.guard.repeated()]
+    if not parts:
+        return
+    raise NumericalFaultError(
+        f"At step {model.num_timesteps}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
+        f"the {' and the '.join(parts)} was not finite. {save_last_good_state(model)} Smaller learning rates may help."
+    )
+
+
+def save_last_good_state(model: DreamerV2) -> str:
+    """Write a checkpoint where a RunCheckpointCallback keeps the run, else a snapshot into the folder of the log.
+
+    :param model: whose weights are finite
+    :return: a sentence that says where it is, or why there is none
+    """
+    try:
+        if model.checkpoint is not None:
+            return f"The last good state is in {model.checkpoint()}."
+        path = Path(model.logger.get_dir() or ".").resolve() / f"last_good_state_{model.num_timesteps}.zip"
+        model.save(path)
+        return f"The last good state is in {path}."
+    except (OSError, ValueError) as error:
+        return f"The last good state could not be written: {error}"

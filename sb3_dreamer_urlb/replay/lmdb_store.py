@@ -1,0 +1,262 @@
+"""Finished episodes in an LMDB file: they survive the process, and need no memory (spec/reliability "Replay").
+
+An episode is stored in chunks of ``CHUNK`` rows, each the raw bytes of one column after the other. Its chunks, the
+removal of what it drives out and the new cursor are one transaction: after a kill at any moment the file holds whole
+episodes and a cursor that tells which.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import lmdb
+import numpy as np
+
+#: rows that are read and written together
+CHUNK = 25
+VERSION = 1
+META = b"meta"
+FREE_PAGES = 16
+#: what a file needs beyond the rows: pages, freed ones that readers still see
+SPARE = 64 << 20
+RESERVE = 1 << 20
+
+
+class ReplayStoreError(RuntimeError):
+    """A replay store cannot be used; the message names its folder and why."""
+
+
+class StoredEpisode:
+    """An episode in the file; reads when asked.
+
+    :param store: that holds it
+    :param number: of the episode, counted over the store's life
+    :param length: rows
+    """
+
+    def __init__(self, store: LmdbStore, number: int, length: int):
+        self.store, self.number, self.length = store, number, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Some rows of every column."""
+        return self.store.read(self, start, stop)
+
+    def __getattr__(self, name: str) -> Any:
+        # A column by its name, whole.
+        if name.startswith("_") or name not in self.store.layout:
+            raise AttributeError(name)
+        return self.rows(0, self.length)[name]
+
+
+class LmdbStore:
+    """A queue of episodes on disk, for one process.
+
+    :param path: folder of the file
+    :param layout: name → (dtype, shape of a row) of each column
+    :param identity: what rows of another run must agree in to be taken over, JSON
+    :param map_size: bytes that the file may have; the oldest episodes go when they do not suffice
+    :raises ReplayStoreError: if another process uses it, it is damaged, or holds rows of something else
+    """
+
+    def __init__(
+        self, path: Path, layout: dict[str, tuple[np.dtype, tuple[int, ...]]], identity: dict[str, Any], map_size: int
+    ):
+        self.path, self.layout, self.map_size = path, layout, map_size
+        #: LMDB needs room even to remove something
+        self.reserve = min(map_size // 8, RESERVE)
+        self.row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
+        columns = {name: [str(dtype), list(shape)] for name, (dtype, shape) in layout.items()}
+        self._identity = {"version": VERSION, "chunk": CHUNK, "columns": columns, **identity}
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._lock = self._take_lock()
+        try:
+            self.env = lmdb.open(str(path), map_size=map_size - self.reserve, readahead=False, meminit=False, max_dbs=0)
+        except lmdb.Error as error:
+            self._lock.close()
+            raise ReplayStoreError(f"{path} cannot be opened: {error}") from None
+        self._closer = weakref.finalize(self, _close, self.env, self._lock)
+        try:
+            self._open()
+        except Exception:
+            self.close()
+            raise
+
+    def _take_lock(self) -> IO[str]:
+        lock = open(self.path / "writer.lock", "a+")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            raise ReplayStoreError(f"{self.path} is in use by another run, or by another buffer of this one.") from None
+        return lock
+
+    def _open(self) -> None:
+        info = self.env.info()
+        # LMDB need not have written its last few pages, if they are free.
+        needed = (info["last_pgno"] + 1 - FREE_PAGES) * self.env.stat()["psize"]
+        if os.path.getsize(self.path / "data.mdb") < needed:
+            # Reading on would end in SIGBUS.
+            raise ReplayStoreError(f"{self.path} is damaged: data.mdb is shorter than its {needed} bytes.")
+        self.first, self.lengths, self.counters = 0, [], {"finished_count": 0, "longest": 0}
+        with self.env.begin() as transaction:
+            stored = transaction.get(META)
+        if stored is None:
+            return
+        try:
+            meta = json.loads(bytes(stored))
+            identity, first, lengths, counters = meta["identity"], meta["first"], meta["lengths"], meta["counters"]
+            self.first, self.lengths = int(first), [int(length) for length in lengths]
+            self.counters = {name: int(counters[name]) for name in self.counters}
+            damaged = self.first < 0 or any(length < 1 for length in self.lengths)
+        except (ValueError, KeyError, TypeError):
+            damaged = True
+        if damaged:
+            raise ReplayStoreError(f"{self.path} is damaged: its cursor cannot be read.")
+        for name, value in self._identity.items():
+            if identity.get(name) != value:
+                raise ReplayStoreError(
+                    f"{self.path} holds rows of another run: {name} is {identity.get(name)!r}, expected {value!r}. "
+                    "Choose another path, or remove the folder."
+                )
+
+    def close(self) -> None:
+        """Close the file. May be called again."""
+        self._closer()
+
+    # -- the queue -----------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def __getitem__(self, index: int) -> StoredEpisode:
+        index = range(len(self.lengths))[index]
+        return StoredEpisode(self, self.first + index, self.lengths[index])
+
+    def __iter__(self) -> Iterator[StoredEpisode]:
+        return (self[index] for index in range(len(self)))
+
+    def popleft(self) -> StoredEpisode:
+        """Remove the oldest episode."""
+        oldest = self[0]
+        self.change(None, 1, self.counters)
+        return oldest
+
+    def change(self, episode: Any, leaving: int, counters: dict[str, int]) -> int:
+        """Add an episode, let the oldest go and note the counters, in one transaction.
+
+        :param episode: to add; None for none
+        :param leaving: how many of the oldest go
+        :param counters: to keep beside
+        :return: how many more had to go
+        :raises ReplayStoreError: if it does not even fit alone
+        :raises OSError: if the disk is full; the file stays as it was
+        """
+        more = 0
+        while True:
+            try:
+                self._write(episode, leaving, counters)
+                return more
+            except lmdb.MapFullError:
+                leaving, gone = max(leaving, -(-len(self) // 8)), leaving
+                if not len(self):
+                    raise ReplayStoreError(
+                        f"{self.path}: map_size={self.map_size} bytes are too few for one episode."
+                    ) from None
+                # First make room: LMDB reuses pages from the second transaction after the one that freed them.
+                self.env.set_mapsize(self.map_size)
+                self._write(None, leaving, self.counters)
+                self._write(None, 0, self.counters)
+                self.env.set_mapsize(self.map_size - self.reserve)
+                more, leaving = more + leaving - gone, 0
+            except lmdb.Error as error:
+                # LMDB calls a full disk an input/output error.
+                free = shutil.disk_usage(self.path).free
+                raise OSError(f"{error}, {free} bytes are free (the replay stays as it was): {self.path}") from None
+
+    def _write(self, episode: Any, leaving: int, counters: dict[str, int]) -> None:
+        first = self.first + leaving
+        lengths = [*self.lengths[leaving:], *([] if episode is None else [len(episode)])]
+        meta = {"identity": self._identity, "first": first, "lengths": lengths, "counters": counters}
+        with self.env.begin(write=True) as transaction:
+            for number in range(self.first, first):
+                self._delete(transaction, number, self.lengths[number - self.first])
+            if episode is not None:
+                number = self.first + len(self.lengths)
+                for start in range(0, len(episode), CHUNK):
+                    rows = episode.rows(start, min(start + CHUNK, len(episode)))
+                    value = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in self.layout)
+                    transaction.put(_key(number, start), value)
+            transaction.put(META, json.dumps(meta).encode())
+        self.first, self.lengths, self.counters = first, lengths, dict(counters)
+
+    def roll_back(self, end: int, counters: dict[str, int]) -> None:
+        """Forget the episodes from number ``end`` on: those after a checkpoint.
+
+        :param end: number of the first that goes
+        :param counters: as of the checkpoint
+        :raises ReplayStoreError: if episodes that the checkpoint names are not there
+        """
+        kept = end - self.first
+        if kept > len(self.lengths) or end < 0:
+            raise ReplayStoreError(f"{self.path} lacks episodes that the checkpoint names.")
+        kept = max(kept, 0)
+        meta = {"identity": self._identity, "first": end - kept, "lengths": self.lengths[:kept], "counters": counters}
+        with self.env.begin(write=True) as transaction:
+            for index in range(kept, len(self.lengths)):
+                self._delete(transaction, self.first + index, self.lengths[index])
+            transaction.put(META, json.dumps(meta).encode())
+        self.first, self.lengths, self.counters = end - kept, self.lengths[:kept], dict(counters)
+
+    @staticmethod
+    def _delete(transaction: Any, number: int, length: int) -> None:
+        for start in range(0, length, CHUNK):
+            transaction.delete(_key(number, start))
+
+    # -- rows ----------------------------------------------------------------------------------------------------------
+
+    def read(self, episode: StoredEpisode, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Some rows of an episode.
+
+        :param episode: of this store
+        :param start: first row
+        :param stop: after the last row
+        :return: name → rows, copies
+        :raises ReplayStoreError: if they are not there as they should be
+        """
+        found = {name: np.empty((stop - start, *shape), dtype) for name, (dtype, shape) in self.layout.items()}
+        with self.env.begin(buffers=True) as transaction:
+            for chunk in range(start - start % CHUNK, stop, CHUNK):
+                count = min(CHUNK, len(episode) - chunk)
+                value = transaction.get(_key(episode.number, chunk))
+                if value is None or len(value) != count * sum(self.row_bytes.values()):
+                    raise ReplayStoreError(f"{self.path} is damaged: rows {chunk} on of episode {episode.number} are missing.")
+                low, high = max(start, chunk), min(stop, chunk + count)
+                offset = 0
+                for name, (dtype, shape) in self.layout.items():
+                    size = self.row_bytes[name]
+                    if size:
+                        begin, end = offset + (low - chunk) * size, offset + (high - chunk) * size
+                        part = np.frombuffer(value[begin:end], dtype).reshape(high - low, *shape)
+                        found[name][low - start : high - start] = part
+                    offset += count * size
+        return found
+
+
+def _key(number: int, start: int) -> bytes:
+    """Sorted as written, so that pages fill up one after the other."""
+    return f"{number:016x}{start:08x}".encode()
+
+
+def _close(env: Any, lock: IO[str]) -> None:
+    env.close()
+    lock.close()
