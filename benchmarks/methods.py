@@ -24,7 +24,7 @@ def main() -> None:
             model = make_model(options, intrinsic_reward=name)
             model.learn(max(2 * model.batch_length, 200))
             batch = model.replay_buffer.sample(model.batch_size)
-            rows[name] += seconds(lambda model=model, batch=batch: model.learner.update(batch), 1, model.device)
+            rows[name] += seconds(lambda model=model, batch=batch: model.learner.update(batch), 1, model.device, options.clock)
     median = {name: statistics.median(times) for name, times in rows.items()}
     if options.json:
         print(json.dumps({"benchmark": "methods", "preset": options.preset, "threads": th.get_num_threads(), "seconds": rows}))
