@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.behavior.actor_critic import Actor, Critic, RewardNormalizer, SuccessorCritic
+from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor, Critic, RewardNormalizer, SuccessorCritic
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.types import LatentState
@@ -22,10 +22,16 @@ class Agent(nn.Module):
     :param net_arch: hidden layers of actor and critic
     :param intrinsic: what it explores with, not yet built; None for an agent without skills that learns a task
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
+    :param classes: number of classes of each choice that is an action; empty where actions are numbers
     """
 
     def __init__(
-        self, world_model: WorldModel, net_arch: Sequence[int], intrinsic: IntrinsicReward | None, explores: bool = True
+        self,
+        world_model: WorldModel,
+        net_arch: Sequence[int],
+        intrinsic: IntrinsicReward | None,
+        explores: bool = True,
+        classes: Sequence[int] = (),
     ):
         super().__init__()
         sizes = world_model.sizes
@@ -36,7 +42,11 @@ class Agent(nn.Module):
             self.intrinsic.build(sizes)
         skill_size = 0 if self.skills is None else self.skills.dim
         critic_class = SuccessorCritic if intrinsic is not None and intrinsic.successor_features else Critic
-        self.actor = Actor(sizes.feature, sizes.action, net_arch, skill_size)
+        self.actor: Actor | CategoricalActor
+        if classes:
+            self.actor = CategoricalActor(sizes.feature, classes, net_arch, skill_size)
+        else:
+            self.actor = Actor(sizes.feature, sizes.action, net_arch, skill_size)
         self.critic = critic_class(sizes.feature, net_arch, skill_size)
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.reward_normalizer = RewardNormalizer(intrinsic.momentum if self.explores and intrinsic is not None else 1.0)
@@ -89,7 +99,7 @@ class PlannedAgent:
         return self.agent.world_model.discount(feature)
 
     def act(self, feature: th.Tensor, generator: th.Generator | None) -> th.Tensor:
-        """Sample the actor, (…, n·M, F) → (…, n·M, A) in (-1, 1)."""
+        """Sample the actor, (…, n·M, F) → (…, n·M, A)."""
         return self.agent.actor(feature, self._skill_of(feature)).sample(generator)
 
     def _skill_of(self, feature: th.Tensor) -> th.Tensor | None:

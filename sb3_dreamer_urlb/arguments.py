@@ -6,16 +6,15 @@ import inspect
 import math
 from typing import TYPE_CHECKING, Any
 
-from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
-from sb3_dreamer_urlb.policies import check_image_space
 from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
@@ -131,12 +130,10 @@ def _check_policy_kwargs(model: DreamerV2) -> None:
 def _check_spaces(model: DreamerV2) -> None:
     if getattr(model, "observation_space", None) is None:
         raise ValueError("DreamerV2 needs an environment: env is None.")
-    check_image_space(model.observation_space)
-    space = model.action_space
-    if not isinstance(space, spaces.Box):
-        raise ValueError(f"DreamerV2 needs a Box action space, got {space}.")
-    if not (space.low < space.high).all():
-        raise ValueError(f"Every action dimension needs low < high, got {space} with low={space.low}, high={space.high}.")
+    normalize_images = model.policy_kwargs.get("normalize_images", True)
+    model.policy_class.check_spaces(model.observation_space, model.action_space, normalize_images)
+    if model.action_noise is not None and make_actions(model.action_space).classes:
+        raise ValueError(f"action_noise={model.action_noise!r} needs a Box action space, got {model.action_space}.")
 
 
 def check_env(model: DreamerV2, env: VecEnv) -> None:
@@ -181,10 +178,8 @@ def check_episode_length(buffer: SequenceReplayBuffer) -> None:
 
 def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
     """An attribute of the first environment, through all wrappers; ``default`` where there is none."""
-    try:
-        return env.get_attr(name, indices=0)[0]
-    except AttributeError:
-        return default
+    # Asking a SubprocVecEnv for an attribute that is not there would end its processes.
+    return env.get_attr(name, indices=0)[0] if env.has_attr(name) else default
 
 
 def check_load_keywords(algorithm: type[DreamerV2], kwargs: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ can make the agent deterministic by replacing those two functions.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch as th
 import torch.nn.functional as F
@@ -101,6 +102,11 @@ class BoundedNormal:
         self.mean = mean
         self.std = std
 
+    @property
+    def mode(self) -> th.Tensor:
+        """The most likely action, float (…, A)."""
+        return self.mean
+
     def sample(self, generator: th.Generator | None = None) -> th.Tensor:
         """A reparametrised sample clamped to ±(1 − 1e-6); the clamp passes gradients straight through."""
         sample = self.mean + self.std * draw_normal(self.mean.shape, self.mean, generator)
@@ -114,6 +120,47 @@ class BoundedNormal:
     def log_prob(self, action: th.Tensor) -> th.Tensor:
         """Log-density of ``action``, summed over its dimensions: (…)."""
         return -(0.5 * ((action - self.mean) / self.std).square() + self.std.log() + HALF_LOG_2PI).sum(-1)
+
+
+class OneHotChoices:
+    """The actor's distribution over independent choices among classes, as one-hot vectors one after the other.
+
+    :param logits: of all classes of all choices, float (…, A)
+    :param classes: number of classes of each choice; they sum to A
+    """
+
+    def __init__(self, logits: th.Tensor, classes: Sequence[int]):
+        self.classes = tuple(classes)
+        self.logits = logits.split(self.classes, -1)
+
+    @property
+    def mode(self) -> th.Tensor:
+        """The most likely action, one-hot (…, A)."""
+        return th.cat([F.one_hot(part.argmax(-1), part.shape[-1]).to(part.dtype) for part in self.logits], -1)
+
+    def sample(self, generator: th.Generator | None = None) -> th.Tensor:
+        """One-hot choices with straight-through gradients, (…, A)."""
+        return th.cat([sample_one_hot(part, generator) for part in self.logits], -1)
+
+    def entropy(self) -> th.Tensor:
+        """In nats, summed over the choices: (…)."""
+        return sum((categorical_entropy(part.unsqueeze(-2)) for part in self.logits), th.zeros(()).to(self.logits[0]))
+
+    def log_prob(self, action: th.Tensor) -> th.Tensor:
+        """Log-probability of one-hot choices, (…, A) → (…)."""
+        log_p = th.cat([part.log_softmax(-1) for part in self.logits], -1)
+        return (log_p * action).sum(-1)
+
+
+def one_hot_choices(probs: th.Tensor, classes: Sequence[int], generator: th.Generator | None = None) -> th.Tensor:
+    """Draw one-hot vectors, one for each choice.
+
+    :param probs: of all classes of all choices, (…, A)
+    :param classes: number of classes of each choice; they sum to A
+    :param generator: source of randomness
+    """
+    parts = probs.split(tuple(classes), -1)
+    return th.cat([F.one_hot(draw_classes(part, generator), part.shape[-1]).to(probs.dtype) for part in parts], -1)
 
 
 def bernoulli_nll(logit: th.Tensor, target: th.Tensor) -> th.Tensor:

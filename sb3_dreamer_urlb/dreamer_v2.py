@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -17,14 +18,15 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import arguments, env_steps, numerical_faults, phases, run_folder
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.envs.faults import check_finite_action
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
-from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy
+from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.run_folder import RunFolder
@@ -47,8 +49,8 @@ class DreamerV2(OffPolicyAlgorithm):
     Units: ``learning_starts``, ``train_freq``, ``planner_delay`` and ``buffer_size`` count *agent steps*, as everywhere in
     SB3; ``phase_frames`` counts environment frames (agent steps × action repeat), as in the paper.
 
-    :param policy: ``"CnnPolicy"``
-    :param env: environment, vectorised or not, or its id; image observations, Box actions
+    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for a Dict of both
+    :param env: environment, vectorised or not, or its id; Box, Discrete or MultiDiscrete actions
     :param learning_rate: of the world model and the intrinsic reward; a number or a schedule
     :param actor_learning_rate: number or schedule
     :param critic_learning_rate: number or schedule
@@ -89,12 +91,17 @@ class DreamerV2(OffPolicyAlgorithm):
     :param device: "auto", "cpu", "cuda"
     :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
         faster on this machine at this size; losses, statistics and weights are float32 in any case
-    :param preset: ``"paper"``, ``"small"`` (two CPU cores) or ``"tiny"`` (tests); replaces defaults, never what you write
+    :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
+        replaces defaults, never what you write
     :param _init_setup_model: build the networks now
     :raises ValueError: for arguments or spaces that do not fit, before anything is built
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "CnnPolicy": CnnPolicy,
+        "MlpPolicy": MlpPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
     policy: DreamerPolicy
     policy_class: type[DreamerPolicy]
     replay_buffer: SequenceReplayBuffer
@@ -262,7 +269,7 @@ class DreamerV2(OffPolicyAlgorithm):
             discount_head=bool(self.discount_head),
             intrinsic=self._intrinsic(),
             explores=phases.PHASES[self.phase].explores,
-            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda),
+            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             precision=self.precision,
             **self.policy_kwargs,
         )
@@ -368,6 +375,8 @@ class DreamerV2(OffPolicyAlgorithm):
         assert self.env is not None
         self.replay_buffer.close_streams()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
         self._last_episode_starts = np.ones(self.env.num_envs, bool)
 
     def prepare_env(self, env: GymEnv) -> VecEnv:
@@ -413,14 +422,13 @@ class DreamerV2(OffPolicyAlgorithm):
         """One step of the recurrent agent; what it remembers is the action *as executed*."""
         assert self._last_obs is not None and self._last_episode_starts is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        assert isinstance(observation, th.Tensor)
         state = self._acting_state or self.policy.initial_state(n_envs)
         self.policy.planning = self._planner_is_on()
         with th.no_grad():
             state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
             if phases.PHASES[self.phase].random_warmup and self.phase_timesteps < learning_starts:
                 uniform = np.stack([self.action_space.sample() for _ in range(n_envs)])
-                scaled = self.policy.scale_action(uniform).reshape(n_envs, -1)
+                scaled = self.policy.actions.from_env(uniform)
             else:
                 state = self.policy.choose(state, deterministic=False)
                 scaled = state.action.cpu().numpy()
@@ -443,20 +451,29 @@ class DreamerV2(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """As SB3's, but images are never normalised, and the recurrent state needs to know where episodes begin."""
-        if self._vec_normalize_env is not None:
-            reward = self._vec_normalize_env.get_original_reward()
+        """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
+        normalizer = self._vec_normalize_env
+        if normalizer is None:
+            self._last_original_obs, original_obs = self._last_obs, new_obs  # type: ignore[assignment]
+        else:
+            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
         self.env_faults += env_steps.count_faults(infos)
         # The VecEnv has already begun the next episode: put the true last observation back.
-        next_obs = np.array(new_obs)
+        next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
-            next_obs[i] = infos[i].get("terminal_observation", next_obs[i])
+            if (last := infos[i].get("terminal_observation")) is not None:
+                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        assert isinstance(self._last_obs, np.ndarray) and self._acting_state is not None
+        assert self._acting_state is not None
         skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
-        replay_buffer.add(self._last_obs, next_obs, buffer_action, reward, dones, infos, **skill)
-        self._last_obs = new_obs
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
+        self._last_obs, self._last_original_obs = new_obs, original_obs  # type: ignore[assignment]
         self._last_episode_starts = dones.astype(bool)
+
+    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
+        """The last observation before normalisation, with channels first as the model sees it."""
+        original = normalizer.get_original_obs()
+        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
@@ -514,7 +531,10 @@ class DreamerV2(OffPolicyAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             # The environments are about to be reset.
             self.replay_buffer.close_streams()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
+        return result
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Update on replayed sequences; does nothing while no finished episode is long enough.
@@ -666,3 +686,12 @@ class DreamerV2(OffPolicyAlgorithm):
         buffer = self._new_replay_buffer()
         replay_snapshot.load(buffer, path)
         self.replay_buffer = buffer
+
+
+def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:
+    """Replace the observation of environment ``i``."""
+    if isinstance(observations, dict):
+        for name, values in observations.items():
+            values[i] = observation[name]  # type: ignore[call-overload]
+    else:
+        observations[i] = observation

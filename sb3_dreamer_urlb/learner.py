@@ -20,7 +20,7 @@ from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.memory import keep_freed_memory
 from sb3_dreamer_urlb.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.optim import ClippedAdam
-from sb3_dreamer_urlb.types import LatentState, Metrics, Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 
 @dataclass(frozen=True)
@@ -107,11 +107,11 @@ class Learner:
 
     def _update(self, batch: SequenceBatch) -> Metrics:
         model = self.agent.world_model
-        image = model.preprocess(batch.observation)
+        observation = model.preprocess(batch.observation)
         with self._products():
-            posterior = model.observe(image, batch.action, batch.is_first)
+            posterior = model.observe(observation, batch.action, batch.is_first)
         metrics = self._update_intrinsic(_detached(posterior), batch)
-        metrics.update(self._update_world_model(posterior, image, batch))
+        metrics.update(self._update_world_model(posterior, observation, batch))
         if self.agent.trains_behavior():
             metrics.update(self._update_behavior(posterior.state.detach()))
             if self.agent.explores:
@@ -130,12 +130,18 @@ class Learner:
         metrics["intrinsic_loss"] = loss.detach()
         return metrics
 
-    def _update_world_model(self, posterior: Posterior, image: th.Tensor, batch: SequenceBatch) -> Metrics:
+    def _update_world_model(self, posterior: Posterior, observation: Observation, batch: SequenceBatch) -> Metrics:
         config = self.config
         with self._products():
             reward = self.reward_source.replay_reward(_detached(posterior), batch)
             loss, metrics = self.agent.world_model.loss(
-                posterior, image, reward, batch.is_terminal, config.free_nats, config.kl_balance, config.reward_trains_model
+                posterior,
+                observation,
+                reward,
+                batch.is_terminal,
+                config.free_nats,
+                config.kl_balance,
+                config.reward_trains_model,
             )
         if reward is not batch.reward:
             metrics["intrinsic_replay_reward"] = reward.mean()

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_dreamer_urlb import precision as precisions
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import DynaMPC
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
-from sb3_dreamer_urlb.types import LatentState
+from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
+from sb3_dreamer_urlb.world_model.observations import DictObservations, Images, Observations, vectors
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
-IMAGE_SIZES = (16, 512)
 # Deterministic predictions draw their posterior states and planning noise from this seed, always the same.
 DETERMINISTIC_SEED = 0
 
@@ -35,7 +35,7 @@ class ActingState:
     """What an acting agent remembers from one step to the next, for n environments.
 
     :param latent: posterior state, (n, …)
-    :param action: the last action as executed, float (n, A) in [-1, 1]
+    :param action: the last action as executed, float (n, A) in [-1, 1], or one-hot
     :param plan: the planner's mean, float (n, H, A); H is 0 without a planner
     :param skill: that is being followed, float (n, W); W is 0 without skills
     :param steps: observations since the episode began, int64 (n,)
@@ -54,17 +54,17 @@ class ActingState:
 
 
 class DreamerPolicy(BasePolicy):
-    """The agent's networks behind SB3's policy interface, for image observations and Box actions.
+    """The agent's networks behind SB3's policy interface. This class is for images; the two below it for other observations.
 
-    :param observation_space: one uint8 image, channels first or last
-    :param action_space: Box with finite bounds
+    :param observation_space: images, channels first: uint8, or floats without ``normalize_images``
+    :param action_space: Box with finite bounds, Discrete or MultiDiscrete
     :param lr_schedule: unused here (the learner owns the optimisers), part of SB3's interface
     :param deter_size: D, size of the deterministic state
     :param hidden_size: width of the RSSM's hidden layers
     :param stoch_variables: S categoricals in the stochastic state
     :param stoch_classes: K classes each
     :param cnn_depth: channels of the first convolution
-    :param net_arch: hidden layers of every head, actor and critic, [400] * 4 if None
+    :param net_arch: hidden layers of every head, actor, critic, encoder and decoder of vectors, [400] * 4 if None
     :param gamma: discount factor
     :param discount_head: learn which states terminate
     :param intrinsic: what the agent explores with, not yet built; None for an agent that learns a task
@@ -72,9 +72,12 @@ class DreamerPolicy(BasePolicy):
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
     :param precision: of the planner's products, see :class:`~sb3_dreamer_urlb.DreamerV2`; all else here is float32
-    :param normalize_images: part of SB3's interface; uint8 images are always scaled to [-0.5, 0.5]
+    :param normalize_images: False takes images of any dtype, scaled from their space's bounds instead of from [0, 255]
     :raises ValueError: for spaces or sizes that do not fit
     """
+
+    #: from an observation space, and ``normalize_images``, to what the world model sees; raises UnsupportedSpaceError
+    kind_of_observations: ClassVar[Callable[..., Observations]] = Images
 
     def __init__(
         self,
@@ -112,20 +115,36 @@ class DreamerPolicy(BasePolicy):
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
         if len(net_arch) == 0:
             raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
+        self.observations = self._observations(observation_space, normalize_images)
+        self.actions = make_actions(action_space)
+        if planner is not None and planner.classes != self.actions.classes:
+            raise ValueError(f"The planner chooses among the classes {planner.classes}, the actions are {action_space}.")
         world_model = WorldModel(
-            image_shape=check_image_space(observation_space),
-            action_size=spaces.flatdim(action_space),
+            observations=self.observations,
+            action_size=self.actions.size,
             net_arch=net_arch,
             gamma=gamma,
             discount_head=discount_head,
             **sizes,
         )
-        self.agent = Agent(world_model, net_arch, intrinsic, explores)
+        self.agent = Agent(world_model, net_arch, intrinsic, explores, self.actions.classes)
         self.intrinsic = intrinsic
         self.planner = planner
         self.planning = planning
         self.precision = precision
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
+
+    @classmethod
+    def check_spaces(cls, observation_space: spaces.Space, action_space: spaces.Space, normalize_images: bool = True) -> None:
+        """
+        :raises UnsupportedSpaceError: for a space that this policy does not take
+        """
+        cls._observations(observation_space, normalize_images)
+        make_actions(action_space)
+
+    @classmethod
+    def _observations(cls, space: spaces.Space, normalize_images: bool) -> Observations:
+        return cls.kind_of_observations(space, normalize_images)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         parameters = super()._get_constructor_parameters()
@@ -181,11 +200,11 @@ class DreamerPolicy(BasePolicy):
         return th.zeros(n, horizon, self.agent.actor.action_size, device=self.device)
 
     def observe(
-        self, observation: th.Tensor, state: ActingState, is_first: th.Tensor, generator: th.Generator | None = None
+        self, observation: Observation, state: ActingState, is_first: th.Tensor, generator: th.Generator | None = None
     ) -> ActingState:
         """Take an observation in: one posterior step.
 
-        :param observation: uint8 (n, C, height, width)
+        :param observation: as the environment gave it, (n, …)
         :param state: the memory before it
         :param is_first: bool (n,), true where an episode begins
         :param generator: source of randomness
@@ -215,21 +234,21 @@ class DreamerPolicy(BasePolicy):
         """Choose the next action, with the planner if it is on, with the actor otherwise; at random if it never learns.
 
         :param state: the memory after :meth:`observe`
-        :param deterministic: the actor's mean, or a plan without exploration noise
+        :param deterministic: the actor's most likely action, or a plan without exploration noise
         :param generator: source of randomness
         :return: the memory with the chosen action
         """
         plan, skill = state.plan, state.skill
         if self.agent.acts_randomly():
             generator = self._moved_on(generator, state.steps)
-            action = 2 * th.rand(state.action.shape, generator=generator, device=self.device) - 1
+            action = self.actions.random(len(state.action), generator, self.device)
         elif self.planner is not None and self.planning:
             planned = PlannedAgent(self.agent, skill)
             with precisions.products(self.device, self.planner_dtype):
                 action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
-            action = policy.mean if deterministic else policy.sample(generator)
+            action = policy.mode if deterministic else policy.sample(generator)
         return dataclasses.replace(state, action=action, plan=plan)
 
     # -- SB3's interface -----------------------------------------------------------------------------------------------
@@ -243,10 +262,10 @@ class DreamerPolicy(BasePolicy):
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Action for each observation; never changes the policy, all memory travels in ``state``.
 
-        :param observation: uint8 image(s), (height, width, C) or (C, height, width), with or without leading n
+        :param observation: from the observation space, with or without leading n; uint8 images with channels first or last
         :param state: what the last call returned; None starts afresh
         :param episode_start: bool (n,), true where a new episode begins
-        :param deterministic: mean action (or plan without exploration noise); draws of the posterior and the planner
+        :param deterministic: most likely action (or plan without exploration noise); draws of the posterior and the planner
             then come from a fixed seed, so equal inputs give equal actions and the global generators stay untouched
         :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
         """
@@ -254,10 +273,8 @@ class DreamerPolicy(BasePolicy):
         if isinstance(observation, tuple):
             raise ValueError("predict() takes the observation, got a tuple: Gymnasium's `obs, info = env.reset()`?")
         tensor, vectorized = self.obs_to_tensor(observation)
-        assert isinstance(tensor, th.Tensor)
-        if tensor.dtype != th.uint8:
-            raise ValueError(f"Images must be uint8 in [0, 255], got {tensor.dtype}.")
-        n = tensor.shape[0]
+        self.observations.check(tensor)
+        n = batch_size(tensor)
         memory = self.initial_state(n) if state is None else self._memory(state, n)
         starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)
         if len(starts) != n:
@@ -270,11 +287,8 @@ class DreamerPolicy(BasePolicy):
         return action if vectorized else action[0], memory.to_numpy()
 
     def to_env_action(self, action: np.ndarray) -> np.ndarray:
-        """From [-1, 1], (n, A), to the action space's bounds, shape and dtype."""
-        space = self.action_space
-        assert isinstance(space, spaces.Box)
-        unscaled = self.unscale_action(action.reshape((-1, *space.shape)))
-        return np.clip(unscaled, space.low, space.high).astype(space.dtype)
+        """From the agent's actions, (n, A), to the action space's bounds, shape and dtype."""
+        return self.actions.to_env(action)
 
     def _memory(self, state: tuple[np.ndarray, ...], n: int) -> ActingState:
         if not isinstance(state, tuple) or len(state) != 6:
@@ -285,32 +299,26 @@ class DreamerPolicy(BasePolicy):
         return ActingState(LatentState(stoch, deter), action, plan, skill, steps)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
-        n = observation.shape[0]
+        n = batch_size(observation)
         is_first = th.ones(n, dtype=th.bool, device=self.device)
         return self.choose(self.observe(observation, self.initial_state(n), is_first), deterministic).action
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """Actions in [-1, 1] at the beginning of an episode, (n, A)."""
+        """The agent's actions at the beginning of an episode, (n, A)."""
         return self._predict(observation, deterministic)
 
 
-def check_image_space(space: spaces.Space) -> tuple[int, int, int]:
-    """Shape of the images, channels first.
-
-    :raises ValueError: if the space is not one uint8 image, channels first, square, and of a size the networks take
-    """
-    if not isinstance(space, spaces.Box) or not is_image_space(space):
-        raise ValueError(
-            "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), "
-            f"got {space}. For dm_control tasks use gymnasium.make('urlb/<domain>-<task>-v0')."
-        )
-    channels, height, width = space.shape
-    low, high = IMAGE_SIZES
-    if height != width or not low <= height <= high:
-        raise ValueError(f"Images must be square, {low} to {high} pixels wide, got {height}×{width}: resize them.")
-    return channels, height, width
-
-
-#: what users write
+#: the agent for images, and what users write for it
 CnnPolicy = DreamerPolicy
+
+
+class MlpPolicy(DreamerPolicy):
+    """The agent for vectors: Box, MultiBinary, Discrete and MultiDiscrete observations, flattened as in SB3."""
+
+    kind_of_observations: ClassVar[Callable[..., Observations]] = vectors
+
+
+class MultiInputPolicy(DreamerPolicy):
+    """The agent for Dict observations: images and vectors by name."""
+
+    kind_of_observations: ClassVar[Callable[..., Observations]] = DictObservations

@@ -40,6 +40,30 @@ PRESETS: dict[str, dict[str, Any]] = {
             "net_arch": [128] * 3,
         },
     },
+    # Small tasks seen as vectors, on one CPU core: benchmarks/vector_tasks.py. A first guess, see docs/results.md. Without
+    # pixels there is little to say in nats, so none are free; and thousands of updates must do.
+    "vector": {
+        "learning_rate": 1e-3,
+        "actor_learning_rate": 5e-4,
+        "critic_learning_rate": 1e-3,
+        "batch_size": 16,
+        "batch_length": 16,
+        "train_freq": 2,
+        "learning_starts": 200,
+        "buffer_size": 100_000,
+        "ent_coef": 1e-3,
+        "free_nats": 0.0,
+        "target_update_interval": 50,
+        "planner_kwargs": {"n_samples": 64, "iterations": 6, "top_k": 8, "mixture": 0.5},
+        "policy_kwargs": {
+            "cnn_depth": 8,
+            "deter_size": 64,
+            "hidden_size": 64,
+            "stoch_variables": 8,
+            "stoch_classes": 8,
+            "net_arch": [64] * 2,
+        },
+    },
     # For tests: everything runs, nothing is learnt.
     "tiny": {
         "batch_size": 2,

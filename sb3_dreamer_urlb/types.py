@@ -7,18 +7,38 @@ W skill size.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch as th
 
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.world_model.observations import Observations
+
 Metrics = dict[str, th.Tensor]
+#: of one kind, or several by name (Dict spaces)
+Observation = th.Tensor | dict[str, th.Tensor]
+
+
+def map_observation(function: Callable[[th.Tensor], th.Tensor], observation: Observation) -> Observation:
+    """Apply a function to an observation, or to each of several."""
+    if isinstance(observation, dict):
+        return {key: function(part) for key, part in observation.items()}
+    return function(observation)
+
+
+def batch_size(observation: Observation) -> int:
+    """Length of the first dimension."""
+    first = next(iter(observation.values())) if isinstance(observation, dict) else observation
+    return len(first)
 
 
 @dataclass
 class SequenceBatch:
     """B sequences of T rows. Row t holds observation t with the action and the reward that *led to* it.
 
-    :param observation: images, uint8 (B, T, C, height, width)
+    :param observation: as the environment gave it, e.g. images, uint8 (B, T, C, height, width); by name for Dict spaces
     :param action: float32 (B, T, A) in [-1, 1]; zeros in an episode's first row
     :param reward: float32 (B, T); zero in an episode's first row
     :param is_first: bool (B, T), true for an episode's first row; the first row of every chunk counts as one
@@ -26,7 +46,7 @@ class SequenceBatch:
     :param skill: float32 (B, T, W), the skill that each row's action followed; None without skills
     """
 
-    observation: th.Tensor
+    observation: Observation
     action: th.Tensor
     reward: th.Tensor
     is_first: th.Tensor
@@ -114,7 +134,7 @@ class ModelSizes:
 
     :param action: A, :param embed: E, :param feature: F, :param deter: D
     :param net_arch: widths of the hidden layers of every head, actor and critic
-    :param image_shape: (channels, height, width)
+    :param observations: what the model sees
     :param cnn_depth: channels of the encoder's first convolution
     """
 
@@ -123,7 +143,7 @@ class ModelSizes:
     feature: int
     deter: int
     net_arch: tuple[int, ...]
-    image_shape: tuple[int, int, int]
+    observations: Observations
     cnn_depth: int
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from fake_envs import CounterEnv
+from gymnasium import spaces
 from hypothesis import settings
 
 from sb3_dreamer_urlb import DreamerV2
@@ -15,6 +17,7 @@ from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.types import Posterior, SequenceBatch
+from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 IMAGE, ACTIONS = (3, 16, 16), 2
@@ -52,9 +55,9 @@ def seeded() -> None:
 def tiny_model() -> Callable[..., DreamerV2]:
     """Make a tiny DreamerV2 on the counting environment, or on the one given."""
 
-    def make(env: Any = None, **kwargs: Any) -> DreamerV2:
+    def make(env: Any = None, policy: str = "CnnPolicy", **kwargs: Any) -> DreamerV2:
         env = CounterEnv() if env is None else env
-        return DreamerV2("CnnPolicy", env, **{"preset": "tiny", "seed": 0, "device": "cpu", **kwargs})
+        return DreamerV2(policy, env, **{"preset": "tiny", "seed": 0, "device": "cpu", **kwargs})
 
     return make
 
@@ -65,7 +68,7 @@ def world_model(seeded: None) -> Callable[..., WorldModel]:
 
     def make(**kwargs: Any) -> WorldModel:
         sizes = {
-            "image_shape": IMAGE,
+            "observations": Images(spaces.Box(0, 255, IMAGE, np.uint8)),
             "action_size": ACTIONS,
             "cnn_depth": 2,
             "deter_size": 8,

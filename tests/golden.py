@@ -18,6 +18,7 @@ from unittest import mock
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
@@ -27,6 +28,7 @@ from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
+from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 RELATIVE, ABSOLUTE = 1e-4, 2e-5
@@ -142,7 +144,7 @@ class Case:
         size, (method, hyperparameters) = self.size, METHODS[self.config["agent"]]
         net_arch = [size["units"]] * size["layers"]
         world_model = WorldModel(
-            image_shape=self.data["update0.in.observation"].shape[2:],
+            observations=Images(spaces.Box(0, 255, self.data["update0.in.observation"].shape[2:], np.uint8)),
             action_size=size["act"],
             cnn_depth=size["depth"],
             deter_size=size["deter"],

@@ -13,10 +13,12 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, SnapshotCallback, dreamer_v2, policies, register_intrinsic_reward
 from sb3_dreamer_urlb.arguments import INTEGERS, NUMBERS, SHORT_EPISODES
+from sb3_dreamer_urlb.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.evaluation.scores import normalized_score
 from sb3_dreamer_urlb.intrinsic import LBS
 
@@ -53,18 +55,60 @@ def _image(*shape, low=0, high=255, dtype=np.uint8):
         (_image(12, low=-1, high=1, dtype=np.float32), r"needs image observations.*\(12,\)"),
         (_image(16, 16, 3, high=100), "needs image observations.*100"),
         (spaces.Dict({"image": _image(16, 16, 3)}), "needs image observations.*Dict|dict observation space"),
-        (_image(16, 20, 3), "must be square, 16 to 512.*16×20"),
-        (_image(12, 12, 3), "must be square, 16 to 512.*12×12"),
-        (_image(520, 520, 1), "must be square, 16 to 512.*520×520"),
+        (_image(16, 12, 3), "must be 16 to 512 pixels high and wide, got 16×12"),
+        (_image(12, 16, 3), "must be 16 to 512 pixels high and wide, got 12×16"),
+        (_image(520, 520, 1), "must be 16 to 512 pixels high and wide, got 520×520"),
     ],
 )
 def test_observation_spaces(refused, space, message):
     refused(message, CounterEnv(observation_space=space))
 
 
-@pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3)])
-def test_action_spaces(refused, space):
-    refused("needs a Box action space, got Multi|needs a Box action space, got Disc", CounterEnv(action_space=space))
+@pytest.mark.parametrize(
+    ("policy", "space", "message"),
+    [
+        ("MlpPolicy", spaces.Text(3), r"MlpPolicy needs one of the observation spaces Box, .*got Text"),
+        ("MlpPolicy", spaces.Tuple([spaces.Discrete(2)]), r"MlpPolicy needs one of the observation spaces .*got Tuple"),
+        ("MultiInputPolicy", spaces.Discrete(4), r"MultiInputPolicy needs a Dict of observations, got Discrete\(4\)"),
+        ("MultiInputPolicy", spaces.Dict({"a": spaces.Text(3)}), "Observation 'a': MlpPolicy needs .*got Text"),
+        ("MultiInputPolicy", spaces.Dict({"a": _image(3, 12, 12)}), "Observation 'a': Images must be 16 to 512.*12×12"),
+    ],
+)
+def test_observation_spaces_of_other_policies(policy, space, message):
+    with pytest.raises(UnsupportedSpaceError, match=message):
+        DreamerV2.policy_aliases[policy].check_spaces(space, spaces.Discrete(2))
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (_image(16, 16, 3, low=-np.inf, high=np.inf, dtype=np.float32), "Images need finite bounds"),
+        (_image(16, 16, 3, high=1, dtype=np.float32), "must have their channels first"),
+        (_image(7, high=1, dtype=np.float32), "needs image observations"),
+    ],
+)
+def test_float_images(refused, space, message):
+    refused(message, CounterEnv(observation_space=space), policy_kwargs={"normalize_images": False})
+
+
+@pytest.mark.parametrize("error", [ValueError, AssertionError])
+@pytest.mark.parametrize("space", [spaces.MultiBinary(3), spaces.Dict({"a": spaces.Discrete(2)})])
+def test_action_spaces(refused, space, error):
+    """A wrong value as everywhere here, and what SB3 raises."""
+    refused(
+        f"needs a Box, Discrete or MultiDiscrete action space, got {type(space).__name__}",
+        CounterEnv(action_space=space),
+        error,
+    )
+
+
+def test_action_noise_needs_numbers(refused):
+    noise = NormalActionNoise(np.zeros(2), np.ones(2))
+    refused(
+        r"action_noise=.* needs a Box action space, got Discrete\(2\)",
+        CounterEnv(action_space=spaces.Discrete(2)),
+        action_noise=noise,
+    )
 
 
 def test_unbounded_actions(refused):
@@ -176,8 +220,8 @@ def test_planner_kwargs_without_a_planner(refused):
 
 
 def test_unknown_policy():
-    with pytest.raises(ValueError, match=r"Unknown policy 'MlpPolicy'; known are .*'CnnPolicy'"):
-        DreamerV2("MlpPolicy", CounterEnv(), preset="tiny")
+    with pytest.raises(ValueError, match=r"Unknown policy 'LstmPolicy'; known are .*'CnnPolicy'"):
+        DreamerV2("LstmPolicy", CounterEnv(), preset="tiny")
 
 
 def test_unknown_policy_kwargs(refused):

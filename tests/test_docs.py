@@ -91,6 +91,13 @@ def test_an_intrinsic_reward_of_ones_own(small_world):
     assert dreamer_v2.DreamerV2.load("own").policy.agent.intrinsic is not None
 
 
+def test_cartpole(monkeypatch):
+    monkeypatch.setitem(PRESETS, "vector", PRESETS["tiny"])
+    [block] = code_blocks("docs/sb3.md")
+    model = run(block.replace("10_000", "200").replace("batch_length=8", "batch_length=4"), {})["model"]
+    assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
+
+
 def test_every_local_link_leads_somewhere():
     for page in (ROOT / "README.md", ROOT / "SECURITY.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):

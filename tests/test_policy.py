@@ -300,4 +300,4 @@ def test_standalone_policy():
     policy = DreamerPolicy(image, action, lambda _: 0.0, 8, 8, 2, 4, 2, [8, 8])
     chosen, state = policy.predict(np.zeros((40, 40, 3), np.uint8))
     assert action.contains(chosen) and state[0].shape == (1, 8)
-    assert DreamerV2.policy_aliases == {"CnnPolicy": DreamerPolicy}
+    assert DreamerV2.policy_aliases["CnnPolicy"] is DreamerPolicy

@@ -704,7 +704,8 @@ def test_replay_files(tiny_model, tmp_path, monkeypatch, member_bytes):
     before, after = model.replay_buffer, other.replay_buffer
     assert len(before.episodes) == len(after.episodes) > 3
     for one, two in zip(before.episodes, after.episodes, strict=True):
-        assert all(np.array_equal(getattr(one, name), getattr(two, name)) for name in one.COLUMNS)
+        assert list(one.columns) == list(two.columns)
+        assert all(np.array_equal(rows, two.columns[name]) for name, rows in one.columns.items())
     assert (after.finished_count, after.longest, after.finished_rows) == (
         before.finished_count, before.longest, before.finished_rows,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.distributions import BoundedNormal
+from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import Imagination, Metrics
@@ -36,6 +36,26 @@ class Actor(nn.Module):
         hidden = self.body.hidden(_with_skill(feature, skill))
         std = 2 * th.sigmoid(full(self.out_std(hidden)) / 2) + MIN_STD
         return BoundedNormal(th.tanh(full(self.body.out(hidden))), std)
+
+
+class CategoricalActor(MLP):
+    """π(a | z) over choices among classes: one-hot actions with straight-through gradients (DreamerV2).
+
+    :param feature_size: F
+    :param classes: number of classes of each choice
+    :param net_arch: widths of the hidden layers
+    :param skill_size: W, 0 without skills: π(a | z, w)
+    """
+
+    def __init__(self, feature_size: int, classes: Sequence[int], net_arch: Sequence[int], skill_size: int = 0):
+        super().__init__(feature_size + skill_size, net_arch, sum(classes))
+        self.scalar = False
+        self.classes = tuple(classes)
+        self.action_size = sum(classes)
+
+    def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> OneHotChoices:  # type: ignore[override]
+        """(…, F) and the skill followed there, (…, W), → distribution over (…, A)."""
+        return OneHotChoices(super().forward(_with_skill(feature, skill)), self.classes)
 
 
 class Critic(MLP):

@@ -79,11 +79,11 @@ def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: 
     model, device = policy.agent.world_model, policy.device
     end = min(start + CONTEXT + steps, len(episode.observations))
     truth = episode.observations[start:end]
-    scaled = policy.scale_action(episode.actions.reshape(len(episode.actions), *policy.action_space.shape))  # type: ignore[misc]
+    scaled = policy.actions.from_env(episode.actions)
     # Row t holds the action that led to observation t.
     led = np.concatenate([np.zeros_like(scaled[:1]), scaled])[start:end].reshape(len(truth), -1)
     action = th.as_tensor(led, dtype=th.float32, device=device)
-    image = model.preprocess(th.as_tensor(truth, device=device).permute(0, 3, 1, 2)).unsqueeze(0)
+    image = model.preprocess(th.as_tensor(truth, device=device).permute(0, 3, 1, 2))[None]  # type: ignore[index]
     is_first = th.zeros(1, CONTEXT, dtype=th.bool, device=device)
     is_first[:, 0] = True
     seen = model.observe(image[:, :CONTEXT], action[None, :CONTEXT], is_first)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch as th
 import torch.nn.functional as F
 
-from sb3_dreamer_urlb.behavior.actor_critic import Actor
+from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor
 from sb3_dreamer_urlb.intrinsic.base import RewardHead
 from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
 from sb3_dreamer_urlb.intrinsic.particles import check_neighbours, knn_distances
@@ -65,7 +65,7 @@ class APS(SkillReward):
         relative = distance / self.distance_moments.mean
         return (relative - DISTANCE_FLOOR).clamp(min=0).mean(-1).log1p()
 
-    def choose_skill(self, actor: Actor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
+    def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
         """The least-squares solution w of r_t · w ≈ φ(z_t), at unit length; a random skill if there was no reward at all.
 
         The features are the pre-trained ones. The authors' code forgets to carry them over and fits random features.

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch as th
 import torch.nn.functional as F
 
-from sb3_dreamer_urlb.behavior.actor_critic import Actor
+from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor
 from sb3_dreamer_urlb.intrinsic.base import RewardHead
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.intrinsic.skills import OneHotSkills
@@ -46,7 +46,7 @@ class DIAYN(SkillReward):
         log_q = self.discriminator(imagination.feature).log_softmax(-1)
         return (log_q * imagination.skill).sum(-1) + math.log(self.skills.dim)
 
-    def choose_skill(self, actor: Actor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
+    def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
         """The skill most likely to act as the sequences of large return did.
 
         argmax_w of the mean over sequences of (Σ_t r_t) · (Σ_t log π(a_t | z_t, w)).

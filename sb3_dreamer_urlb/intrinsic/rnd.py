@@ -1,4 +1,4 @@
-"""Random Network Distillation (Burda et al., 2019; paper appendix B): seek images that are not yet known by heart."""
+"""Random Network Distillation (Burda et al., 2019; paper appendix B): seek observations that are not yet known by heart."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
 from sb3_dreamer_urlb.nets import ReLUNet
 from sb3_dreamer_urlb.number_checks import is_integer
-from sb3_dreamer_urlb.types import Metrics, ModelSizes, Posterior, SequenceBatch
-from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
-from sb3_dreamer_urlb.world_model.world_model import WorldModel
+from sb3_dreamer_urlb.types import Metrics, ModelSizes, Observation, Posterior, SequenceBatch, map_observation
 
-PIXEL_BOUND = 5.0
+BOUND = 5.0
 
 
-class ImageNet(nn.Module):
+class ObservationNet(nn.Module):
     """An encoder and three layers, all orthogonal.
 
     :param sizes: of the world model; embedding and widths are the same
@@ -29,22 +27,23 @@ class ImageNet(nn.Module):
 
     def __init__(self, sizes: ModelSizes, outputs: int):
         super().__init__()
-        self.encoder = ConvEncoder(sizes.image_shape, sizes.cnn_depth)
-        for conv in self.encoder.convs:
-            assert isinstance(conv, nn.Conv2d) and conv.bias is not None
-            nn.init.orthogonal_(conv.weight, math.sqrt(2))
-            nn.init.zeros_(conv.bias)
+        self.encoder = sizes.observations.make_encoder(sizes.cnn_depth, sizes.net_arch)
+        for layer in self.encoder.modules():
+            if isinstance(layer, (nn.Conv2d, nn.Linear)):
+                assert layer.bias is not None
+                nn.init.orthogonal_(layer.weight, math.sqrt(2))
+                nn.init.zeros_(layer.bias)
         self.head = ReLUNet([sizes.embed, sizes.embed, sizes.embed, outputs], orthogonal=True)
 
-    def forward(self, image: th.Tensor) -> th.Tensor:
-        """(n, C, height, width) → (n, outputs)."""
-        return self.head(self.encoder(image))
+    def forward(self, observation: Observation) -> th.Tensor:
+        """Preprocessed (n, …) → (n, outputs)."""
+        return self.head(self.encoder(observation))
 
 
 class RND(IntrinsicReward):
     """r_t = ‖f(x_t) − f̄(x_t)‖² / σ: the error of a predictor of a fixed random network, in units of its running deviation.
 
-    Computed on replayed images; the reward head carries it into imagination.
+    Computed on replayed observations; the reward head carries it into imagination.
 
     :param output_size: of the two networks
     :raises ValueError: if it is not positive
@@ -59,8 +58,9 @@ class RND(IntrinsicReward):
         self.output_size = output_size
 
     def build(self, sizes: ModelSizes) -> None:
-        self.predictor = ImageNet(sizes, self.output_size)
-        self.target = ImageNet(sizes, self.output_size).requires_grad_(False)
+        self.observations = sizes.observations
+        self.predictor = ObservationNet(sizes, self.output_size)
+        self.target = ObservationNet(sizes, self.output_size).requires_grad_(False)
         self.error_moments = RunningMoments()
 
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics]:
@@ -75,9 +75,12 @@ class RND(IntrinsicReward):
 
     def _error(self, batch: SequenceBatch) -> th.Tensor:
         """(B·T,)"""
-        image = WorldModel.preprocess(batch.observation).flatten(0, 1)
-        # Each batch is its own reference: whitened per channel, and no outlier beyond five deviations.
-        image = F.batch_norm(image, None, None, training=True).clamp(-PIXEL_BOUND, PIXEL_BOUND)
+        observation = map_observation(_whitened, self.observations.preprocess(batch.observation))
         with th.no_grad():
-            target = self.target(image)
-        return (self.predictor(image) - target).square().mean(-1)
+            target = self.target(observation)
+        return (self.predictor(observation) - target).square().mean(-1)
+
+
+def _whitened(x: th.Tensor) -> th.Tensor:
+    """Each batch is its own reference: whitened per channel, and no outlier beyond five deviations; (B, T, …) → (B·T, …)."""
+    return F.batch_norm(x.flatten(0, 1), None, None, training=True).clamp(-BOUND, BOUND)

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import torch as th
 
-from sb3_dreamer_urlb.behavior.actor_critic import Actor
+from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.types import Posterior, SequenceBatch
@@ -25,7 +25,7 @@ class SkillReward(IntrinsicReward):
         self.skills = skills
 
     @abstractmethod
-    def choose_skill(self, actor: Actor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
+    def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
         """The skill that serves the task best, float (W,).
 
         :param actor: pre-trained

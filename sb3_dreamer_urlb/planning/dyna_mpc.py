@@ -98,6 +98,9 @@ class DynaMPC:
     :param gae_lambda: λ of the returns that rank trajectories, the one the critic was trained with
     """
 
+    #: number of classes of each choice that is an action; none where actions are numbers
+    classes: tuple[int, ...] = ()
+
     def __init__(self, config: PlannerConfig, gae_lambda: float):
         self.config = config
         self.gae_lambda = gae_lambda

@@ -11,7 +11,7 @@ import os
 import warnings
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -19,6 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.env_steps import is_fault
 from sb3_dreamer_urlb.replay import stores
 from sb3_dreamer_urlb.types import SequenceBatch
@@ -26,69 +27,119 @@ from sb3_dreamer_urlb.types import SequenceBatch
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.replay.lmdb_store import LmdbStore
 
+RawObservation = np.ndarray | dict[str, np.ndarray]
+#: column of an observation, or of the part of a Dict observation whose name follows
+OBSERVATION = "observation"
+
 
 class Episode:
     """Contiguous rows that grow while the episode is open.
 
-    :param observation: the episode's first observation
+    :param observation: the episode's first observation; a Dict observation takes one column for each part
     :param action_size: A
     :param skill: under which the first action is chosen, (W,)
     """
 
-    COLUMNS: ClassVar[tuple[str, ...]] = ("observation", "action", "reward", "is_terminal", "skill")
-    length: int
-
-    def __init__(self, observation: np.ndarray, action_size: int, skill: np.ndarray):
+    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray):
         capacity = 128
-        self.observation = np.empty((capacity, *observation.shape), observation.dtype)
-        self.action = np.zeros((capacity, action_size), np.float32)
-        self.reward = np.zeros(capacity, np.float32)
-        self.is_terminal = np.zeros(capacity, bool)
-        self.skill = np.zeros((capacity, len(skill)), np.float32)
-        self.length = 1
-        self.observation[0] = observation
-        self.skill[0] = skill
+        seen = observation_columns(observation)
+        #: rows of each column, the first ``length`` of them filled
+        self.columns: dict[str, np.ndarray] = {
+            **{name: np.empty((capacity, *value.shape), value.dtype) for name, value in seen.items()},
+            "action": np.zeros((capacity, action_size), np.float32),
+            "reward": np.zeros(capacity, np.float32),
+            "is_terminal": np.zeros(capacity, bool),
+            "skill": np.zeros((capacity, len(skill)), np.float32),
+        }
+        self.length = 0
+        self._put({**seen, "skill": skill})
 
     @classmethod
     def of(cls, columns: dict[str, np.ndarray]) -> Episode:
         """A finished episode of given rows, for example from a file.
 
-        :param columns: rows of each of ``COLUMNS``
+        :param columns: rows of each of ``SequenceReplayBuffer.columns``
         """
         episode = cls.__new__(cls)
-        episode.__dict__.update(columns, length=len(columns["reward"]))
+        episode.columns, episode.length = columns, len(columns["reward"])
         return episode
 
     def __len__(self) -> int:
         return self.length
 
-    def append(self, observation: np.ndarray, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray) -> None:
+    @property
+    def observation(self) -> RawObservation:
+        """All rows of it, by name for Dict observations."""
+        return observation_of(self.columns)
+
+    @property
+    def action(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["action"]
+
+    @property
+    def reward(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["reward"]
+
+    @property
+    def is_terminal(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["is_terminal"]
+
+    @property
+    def skill(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["skill"]
+
+    def append(
+        self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
+    ) -> None:
         """Add the row that ``action``, chosen under ``skill``, led to."""
         if self.length == len(self.reward):
             self._resize(2 * self.length)
-        t = self.length
-        self.observation[t] = observation
-        self.action[t] = action
-        self.reward[t] = reward
-        self.is_terminal[t] = is_terminal
-        self.skill[t] = skill
-        self.length += 1
+        seen = observation_columns(observation)
+        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
 
     def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """Some rows of every column, by name; no copies."""
-        return {name: getattr(self, name)[start:stop] for name in self.COLUMNS}
+        return {name: part[start:stop] for name, part in self.columns.items()}
 
     def finish(self) -> Episode:
         """Give unused memory back."""
         self._resize(self.length)
         return self
 
+    def _put(self, row: dict[str, Any]) -> None:
+        for name, value in row.items():
+            self.columns[name][self.length] = value
+        self.length += 1
+
     def _resize(self, capacity: int) -> None:
-        for name in self.COLUMNS:
-            old = getattr(self, name)
+        for name, old in self.columns.items():
             new = np.empty((capacity, *old.shape[1:]), old.dtype)
             new[: self.length] = old[: self.length]
-            setattr(self, name, new)
+            self.columns[name] = new
+
+
+def observation_columns(observation: RawObservation) -> dict[str, np.ndarray]:
+    """The columns that an observation fills: one, or one for each part of a Dict observation."""
+    if isinstance(observation, dict):
+        return {f"{OBSERVATION}/{name}": np.asarray(part) for name, part in observation.items()}
+    return {OBSERVATION: np.asarray(observation)}
+
+
+def observation_of(columns: dict[str, np.ndarray]) -> RawObservation:
+    """The observation among columns; undoes :func:`observation_columns`."""
+    if OBSERVATION in columns:
+        return columns[OBSERVATION]
+    prefix = f"{OBSERVATION}/"
+    return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}
+
+
+def _zeros(space: spaces.Space) -> np.ndarray:
+    assert space.shape is not None
+    return np.zeros(space.shape, space.dtype)
 
 
 class SequenceReplayBuffer(ReplayBuffer):
@@ -215,8 +266,8 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def add(  # type: ignore[override]
         self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
+        obs: RawObservation,
+        next_obs: RawObservation,
         action: np.ndarray,
         reward: np.ndarray,
         done: np.ndarray,
@@ -225,9 +276,9 @@ class SequenceReplayBuffer(ReplayBuffer):
     ) -> None:
         """Store one step of every environment.
 
-        :param obs: what was seen, (n_envs, …); it is a row of its own only where an episode begins
+        :param obs: what was seen, (n_envs, …), by name for Dicts; it is a row of its own only where an episode begins
         :param next_obs: what followed, (n_envs, …); the true last observation where ``done``, not the next episode's first
-        :param action: as executed, in [-1, 1], (n_envs, A)
+        :param action: as executed, in [-1, 1] or one-hot, (n_envs, A)
         :param reward: (n_envs,)
         :param done: (n_envs,)
         :param infos: ``TimeLimit.truncated`` tells truncation from termination; a step marked as a fault is not stored, and
@@ -245,11 +296,19 @@ class SequenceReplayBuffer(ReplayBuffer):
                 continue
             episode = self.open[i]
             if episode is None:
-                episode = self.open[i] = Episode(np.asarray(obs[i]), self.action_dim, skill[i])
+                episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i])
             terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
-            episode.append(next_obs[i], action[i].reshape(-1), float(reward[i]), terminal, skill[i])
+            episode.append(self._row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i])
             if done[i] or len(episode) >= self.max_episode_rows:
                 self._finish(i)
+
+    def _row(self, observation: RawObservation, i: int) -> RawObservation:
+        """The observation of environment ``i``, in the types that its space declares, whatever the environment gives."""
+        space = self.observation_space
+        if isinstance(observation, dict):
+            assert isinstance(space, spaces.Dict)
+            return {name: np.asarray(part[i], space[name].dtype) for name, part in observation.items()}
+        return np.asarray(observation[i], space.dtype)
 
     def close_streams(self) -> None:
         """End the open episodes as truncated: the environments were reset behind their back."""
@@ -289,10 +348,10 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def columns(self) -> dict[str, tuple[th.dtype, tuple[int, ...]]]:
         """What a row of an episode consists of: name → type and shape, for files."""
-        first = np.zeros(self.obs_shape, self.observation_space.dtype)
-        episode = Episode(first, self.action_dim, np.zeros(self.skill_size, np.float32))
-        rows = {name: getattr(episode, name) for name in Episode.COLUMNS}
-        return {name: (th.from_numpy(array[:0]).dtype, array.shape[1:]) for name, array in rows.items()}
+        space = self.observation_space
+        first = {name: _zeros(part) for name, part in space.items()} if isinstance(space, spaces.Dict) else _zeros(space)
+        episode = Episode(first, make_actions(self.action_space).size, np.zeros(self.skill_size, np.float32))
+        return {name: (th.from_numpy(rows[:0]).dtype, rows.shape[1:]) for name, rows in episode.columns.items()}
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
@@ -305,7 +364,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         """Draw sequences: an episode uniformly, then a start uniformly (spec/algorithms §3).
 
         :param batch_size: B
-        :param env: normalises rewards if given
+        :param env: normalises observations and rewards if given
         :return: (B, T, …) on ``device``
         :raises ValueError: if no finished episode has ``batch_length`` rows
         """
@@ -323,8 +382,18 @@ class SequenceReplayBuffer(ReplayBuffer):
                 columns[name][b] = rows
         is_first = np.zeros((batch_size, length), bool)
         is_first[:, 0] = True
+        observation = self._normalize_obs(observation_of(columns), env)
         reward = self._normalize_reward(columns["reward"], env).astype(np.float32, copy=False)
-        parts = [columns["observation"], columns["action"], reward, is_first, columns["is_terminal"]]
-        if self.skill_size:
-            parts.append(columns["skill"])
-        return SequenceBatch(*(th.from_numpy(part).to(self.device, non_blocking=True) for part in parts))
+        return SequenceBatch(
+            {name: self._tensor(part) for name, part in observation.items()}
+            if isinstance(observation, dict)
+            else self._tensor(observation),
+            self._tensor(columns["action"]),
+            self._tensor(reward),
+            self._tensor(is_first),
+            self._tensor(columns["is_terminal"]),
+            self._tensor(columns["skill"]) if self.skill_size else None,
+        )
+
+    def _tensor(self, array: np.ndarray) -> th.Tensor:
+        return th.from_numpy(array).to(self.device, non_blocking=True)

@@ -64,7 +64,7 @@ def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
     size = 0
     for episode in episodes:
         group.append(episode)
-        size += len(episode) * episode.observation[0].nbytes
+        size += len(episode) * sum(rows.nbytes for rows in episode.rows(0, 1).values())
         if size >= MEMBER_BYTES:
             yield group
             group, size = [], 0
@@ -73,7 +73,8 @@ def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
 
 
 def _pack(buffer: SequenceReplayBuffer, group: list[Episode]) -> bytes:
-    columns = {name: np.concatenate([getattr(e, name)[: len(e)] for e in group]) for name in buffer.columns()}
+    rows = [episode.rows(0, len(episode)) for episode in group]
+    columns = {name: np.concatenate([part[name] for part in rows]) for name in buffer.columns()}
     columns[LENGTHS] = np.array([len(episode) for episode in group], np.int64)
     return safetensors.numpy.save(columns)
 

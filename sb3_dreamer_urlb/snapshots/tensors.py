@@ -18,7 +18,7 @@ Table = dict[str, tuple[str, tuple[int, ...]]]
 
 DTYPES = {
     th.float64: "F64", th.float32: "F32", th.float16: "F16", th.bfloat16: "BF16", th.int64: "I64", th.int32: "I32",
-    th.int16: "I16", th.int8: "I8", th.uint8: "U8", th.bool: "BOOL",
+    th.int16: "I16", th.int8: "I8", th.uint64: "U64", th.uint32: "U32", th.uint16: "U16", th.uint8: "U8", th.bool: "BOOL",
 }  # fmt: skip
 SIZES = {name: dtype.itemsize for dtype, name in DTYPES.items()}
 MAX_HEADER = 4 << 20

@@ -16,7 +16,8 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward, registered_intrinsic_rewards
-from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
+from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.planning import CategoricalDynaMPC, DynaMPC, PlannerConfig
 
 TAG = "!"
 CUSTOM = "custom"
@@ -153,12 +154,48 @@ def _box(low: Any, high: Any, shape: list[int], dtype: str) -> spaces.Box:
     return spaces.Box(full[0], full[1], tuple(shape), dtype=np.dtype(dtype).type)  # type: ignore[arg-type]
 
 
+def _discrete(n: int, start: int, dtype: str = "int64") -> spaces.Discrete:
+    # Gymnasium had no other than int64 for a long time.
+    return spaces.Discrete(n, start=start) if dtype == "int64" else spaces.Discrete(n, start=start, dtype=dtype)
+
+
+def _multi_discrete(nvec: Any, start: Any = None, dtype: str = "int64") -> spaces.MultiDiscrete:
+    return spaces.MultiDiscrete(nvec, dtype, start=start)
+
+
+def _dict(parts: list[list[Any]]) -> spaces.Dict:
+    if not all(isinstance(name, str) for name, _ in parts):
+        raise ValueError("it holds a Dict with a name that is no text")
+    return spaces.Dict([(name, space) for name, space in parts])
+
+
+# -- planners --------------------------------------------------------------------------------------------------------------
+
+
+def _planner_fields(planner: DynaMPC) -> tuple[str, dict[str, Any]]:
+    return "planner", {"config": dataclasses.asdict(planner.config), "gae_lambda": planner.gae_lambda}
+
+
+def _categorical_planner_fields(planner: CategoricalDynaMPC) -> tuple[str, dict[str, Any]]:
+    return "categorical planner", {**_planner_fields(planner)[1], "classes": planner.classes}
+
+
+def _categorical_planner(config: dict[str, Any], gae_lambda: float, classes: list[int]) -> CategoricalDynaMPC:
+    if not classes or not all(is_integer(count) and count >= 1 for count in classes):
+        raise ValueError(f"it holds a planner of the classes {str(classes)[:80]}")
+    return CategoricalDynaMPC(PlannerConfig(**config), float(gae_lambda), classes)
+
+
 ENCODERS: dict[type, Callable[[Any], tuple[str, dict[str, Any]]]] = {
     spaces.Box: _box_fields,
-    spaces.Discrete: lambda x: ("Discrete", {"n": x.n, "start": x.start}),
+    spaces.Discrete: lambda x: ("Discrete", {"n": x.n, "start": x.start, "dtype": np.dtype(x.dtype).name}),
     spaces.MultiBinary: lambda x: ("MultiBinary", {"n": x.n}),
-    spaces.MultiDiscrete: lambda x: ("MultiDiscrete", {"nvec": x.nvec}),
-    spaces.Dict: lambda x: ("Dict", {"spaces": dict(x.spaces)}),
+    spaces.MultiDiscrete: lambda x: (
+        "MultiDiscrete",
+        {"nvec": x.nvec, "start": x.start, "dtype": np.dtype(x.dtype).name},
+    ),
+    # In its order, which the networks follow.
+    spaces.Dict: lambda x: ("Dict", {"parts": list(x.spaces.items())}),
     FloatSchedule: lambda x: ("FloatSchedule", {"value_schedule": x.value_schedule}),
     ConstantSchedule: lambda x: ("ConstantSchedule", {"val": x.val}),
     LinearSchedule: lambda x: ("LinearSchedule", {"start": x.start, "end": x.end, "end_fraction": x.end_fraction}),
@@ -167,7 +204,8 @@ ENCODERS: dict[type, Callable[[Any], tuple[str, dict[str, Any]]]] = {
         "OrnsteinUhlenbeckActionNoise",
         {"mean": x._mu, "sigma": x._sigma, "theta": x._theta, "dt": x._dt, "initial_noise": x.initial_noise},
     ),
-    DynaMPC: lambda x: ("planner", {"config": dataclasses.asdict(x.config), "gae_lambda": x.gae_lambda}),
+    DynaMPC: _planner_fields,
+    CategoricalDynaMPC: _categorical_planner_fields,
 }
 DECODERS: dict[str, Callable[..., Any]] = {
     CUSTOM: lambda description: Custom(str(description)),
@@ -175,11 +213,12 @@ DECODERS: dict[str, Callable[..., Any]] = {
     "array": _array,
     "intrinsic": _intrinsic,
     "planner": lambda config, gae_lambda: DynaMPC(PlannerConfig(**config), float(gae_lambda)),
+    "categorical planner": _categorical_planner,
     "Box": _box,
-    "Discrete": lambda n, start: spaces.Discrete(n, start=start),
+    "Discrete": _discrete,
     "MultiBinary": spaces.MultiBinary,
-    "MultiDiscrete": spaces.MultiDiscrete,
-    "Dict": lambda **fields: spaces.Dict(**fields),
+    "MultiDiscrete": _multi_discrete,
+    "Dict": _dict,
     "FloatSchedule": FloatSchedule,
     "ConstantSchedule": lambda val: ConstantSchedule(float(val)),
     "LinearSchedule": lambda start, end, end_fraction: LinearSchedule(float(start), float(end), float(end_fraction)),

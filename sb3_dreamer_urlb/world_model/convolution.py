@@ -29,15 +29,16 @@ SMALL_SIDE = 5
 
 
 def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
-    """``layer(x)``, as matrix products where that is faster.
+    """``layer(x)``, as matrix products where that is faster; never where image or kernel is not square.
 
-    :param layer: square kernel, square stride, no padding
+    :param layer: square stride, no padding
     :param x: (N, C, height, width)
     """
     dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
     transposed, stride = isinstance(layer, nn.ConvTranspose2d), layer.stride[0]
     side = x.shape[-1] if transposed else (x.shape[-1] - layer.kernel_size[0]) // stride + 1
-    if x.device.type != "cpu" or not th.is_grad_enabled() or side > SMALL_SIDE:
+    square = x.shape[-1] == x.shape[-2] and layer.kernel_size[0] == layer.kernel_size[1]
+    if x.device.type != "cpu" or not th.is_grad_enabled() or side > SMALL_SIDE or not square:
         return layer(x)
     assert layer.bias is not None
     # Outside of the function, so that autograd brings the gradients back to float32.

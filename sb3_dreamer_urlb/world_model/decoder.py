@@ -1,13 +1,15 @@
-"""Features → images."""
+"""Features → observations."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
 
@@ -34,22 +36,23 @@ class ConvDecoder(nn.Module):
     harmless since targets lie in [-0.5, 0.5].
 
     :param feature_size: F
-    :param image_shape: (channels, height, width), square
+    :param image_shape: (channels, height, width)
     :param depth: channels of the last hidden stage; they double towards the input
-    :raises ValueError: if the image is not square
     """
 
     def __init__(self, feature_size: int, image_shape: tuple[int, int, int], depth: int):
         super().__init__()
         image_channels, height, width = image_shape
-        if height != width:
-            raise ValueError(f"The decoder makes square images, got {height}×{width} (resize the observation).")
-        kernels = deconvolution_kernels(height)
-        hidden = [depth * 2**i for i in reversed(range(len(kernels) - 1))]
+        rows, columns = deconvolution_kernels(height), deconvolution_kernels(width)
+        stages = max(len(rows), len(columns))
+        # The shorter side waits: a kernel of 1 leaves a 1×1 map as it is.
+        kernels = [([1] * stages + rows)[-stages:], ([1] * stages + columns)[-stages:]]
+        hidden = [depth * 2**i for i in reversed(range(stages - 1))]
         channels = [32 * depth, *hidden, image_channels]
         self.input = nn.Linear(feature_size, channels[0])
         self.deconvs = nn.ModuleList(
-            nn.ConvTranspose2d(*pair, kernel, stride=2) for pair, kernel in zip(pairwise(channels), kernels, strict=True)
+            nn.ConvTranspose2d(*pair, kernel, stride=2)
+            for pair, kernel in zip(pairwise(channels), zip(*kernels, strict=True), strict=True)
         )
 
     def forward(self, feature: th.Tensor) -> th.Tensor:
@@ -70,3 +73,32 @@ class ConvDecoder(nn.Module):
         channels, out, height, width = first.weight.shape
         y = (x @ first.weight.view(channels, -1)).view(-1, out, height, width)
         return y + first.bias.to(y.dtype).view(1, -1, 1, 1)
+
+
+class VectorDecoder(MLP):
+    """ELU layers and a linear output.
+
+    :param feature_size: F
+    :param net_arch: widths of the hidden layers
+    :param size: of the vector
+    """
+
+    def __init__(self, feature_size: int, net_arch: Sequence[int], size: int):
+        super().__init__(feature_size, net_arch, size)
+        self.scalar = False
+
+
+class DictDecoder(nn.Module):
+    """One decoder a name.
+
+    :param decoders: by name
+    """
+
+    def __init__(self, decoders: Mapping[str, nn.Module]):
+        super().__init__()
+        self.names = tuple(decoders)
+        self.decoders = nn.ModuleList(decoders.values())
+
+    def forward(self, feature: th.Tensor) -> dict[str, th.Tensor]:
+        """(…, F) → means by name."""
+        return {name: decoder(feature) for name, decoder in zip(self.names, self.decoders, strict=True)}

@@ -1,20 +1,28 @@
-"""Images → embeddings."""
+"""Observations → embeddings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import torch as th
 import torch.nn.functional as F
 from torch import nn
 
+from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
 
 KERNEL, STRIDE = 4, 2
 
 
-class ConvEncoder(nn.Module):
+class Encoder(nn.Module):
+    """From preprocessed observations, (…), to embeddings, float (…, E)."""
+
+    #: E
+    embed_size: int
+
+
+class ConvEncoder(Encoder):
     """Strided convolutions, an activation after each, flattened channel-first (spec/algorithms §1).
 
     At 64×64 these are DreamerV2's four stages, 64 → 31 → 14 → 6 → 2; other sizes take as many stages as fit.
@@ -46,3 +54,39 @@ class ConvEncoder(nn.Module):
             assert isinstance(conv, nn.Conv2d)
             x = self.activation(convolve(conv, x))
         return full(x).reshape(image.shape[:-3] + (self.embed_size,))
+
+
+class VectorEncoder(MLP, Encoder):
+    """ELU layers; the last one's output is the embedding.
+
+    :param size: of the vector
+    :param net_arch: widths of the layers
+    """
+
+    def __init__(self, size: int, net_arch: Sequence[int]):
+        super().__init__(size, net_arch[:-1], net_arch[-1])
+        self.scalar = False
+        self.embed_size = net_arch[-1]
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """(…, size) → (…, E)."""
+        return F.elu(super().forward(x))
+
+
+class DictEncoder(Encoder):
+    """One encoder a name; their embeddings one after the other.
+
+    :param encoders: by name
+    """
+
+    def __init__(self, encoders: Mapping[str, Encoder]):
+        super().__init__()
+        # A list, because a module's name may hold no dot.
+        self.names = tuple(encoders)
+        self.encoders = nn.ModuleList(encoders.values())
+        self.embed_size = sum(encoder.embed_size for encoder in encoders.values())
+
+    def forward(self, observation: dict[str, th.Tensor]) -> th.Tensor:
+        """Preprocessed observations by name → float (…, E)."""
+        parts = zip(self.names, self.encoders, strict=True)
+        return th.cat([encoder(observation[name]) for name, encoder in parts], -1)

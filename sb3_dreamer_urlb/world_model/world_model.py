@@ -1,4 +1,4 @@
-"""The world model: what the agent learns from images, with or without rewards."""
+"""The world model: what the agent learns from observations, with or without rewards."""
 
 from __future__ import annotations
 
@@ -9,38 +9,37 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.distributions import BoundedNormal
+from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
 from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Posterior
-from sb3_dreamer_urlb.world_model.decoder import ConvDecoder
-from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
+from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Observation, Posterior
+from sb3_dreamer_urlb.world_model.observations import Observations
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 
 class Acts(Protocol):
     """Anything that turns features, and the skills followed, into an action distribution."""
 
-    def __call__(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal: ...
+    def __call__(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal | OneHotChoices: ...
 
 
 class WorldModel(nn.Module):
     """Encoder, RSSM, decoder and reward head of DreamerV2; a discount head where episodes can terminate.
 
-    :param image_shape: (channels, height, width)
+    :param observations: what it sees
     :param action_size: A
     :param cnn_depth: channels of the first convolution
     :param deter_size: D
     :param hidden_size: width of the layers around the GRU
     :param stoch_variables: S
     :param stoch_classes: K
-    :param net_arch: hidden layers of the heads
+    :param net_arch: hidden layers of the heads, and of the encoder and decoder of vectors
     :param gamma: discount factor of a state that does not terminate
     :param discount_head: learn which states terminate
     """
 
     def __init__(
         self,
-        image_shape: tuple[int, int, int],
+        observations: Observations,
         action_size: int,
         cnn_depth: int,
         deter_size: int,
@@ -53,26 +52,26 @@ class WorldModel(nn.Module):
     ):
         super().__init__()
         self.gamma = gamma
-        self.encoder = ConvEncoder(image_shape, cnn_depth)
+        self.observations = observations
+        self.encoder = observations.make_encoder(cnn_depth, net_arch)
         embed = self.encoder.embed_size
         self.rssm = RSSM(action_size, embed, deter_size, hidden_size, stoch_variables, stoch_classes)
         feature = self.rssm.stoch_size + deter_size
-        self.decoder = ConvDecoder(feature, image_shape, cnn_depth)
+        self.decoder = observations.make_decoder(feature, cnn_depth, net_arch)
         self.reward = MLP(feature, net_arch)
         self.discount_logit = MLP(feature, net_arch) if discount_head else None
-        self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch), image_shape, cnn_depth)
+        self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch), observations, cnn_depth)
 
-    @staticmethod
-    def preprocess(observation: th.Tensor) -> th.Tensor:
-        """uint8 images in [0, 255] → float32 in [-0.5, 0.5], same shape."""
-        return th.div(observation, 255.0).sub_(0.5)
+    def preprocess(self, observation: Observation) -> Observation:
+        """What the networks see and predict: images → float32 in [-0.5, 0.5]; vectors and classes → float32 vectors."""
+        return self.observations.preprocess(observation)
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
     def loss(
         self,
         posterior: Posterior,
-        image: th.Tensor,
+        observation: Observation,
         reward: th.Tensor,
         is_terminal: th.Tensor,
         free_nats: float,
@@ -82,7 +81,7 @@ class WorldModel(nn.Module):
         """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
 
         :param posterior: what :meth:`observe` inferred about it, with its graph
-        :param image: that it was inferred from, float (B, T, C, height, width)
+        :param observation: that it was inferred from, preprocessed, (B, T, …)
         :param reward: what the reward head learns, float (B, T)
         :param is_terminal: bool (B, T), what the discount head learns
         :param free_nats: the KL below which the model is not pushed; applied to the batch mean
@@ -91,13 +90,13 @@ class WorldModel(nn.Module):
         :return: loss (scalar) and metrics (detached scalars)
         """
         kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
-        image_nll = distributions.image_nll(self.decoder(posterior.feature), image)
+        seen_losses = self.observations.losses(self.decoder(posterior.feature), observation)
         reward_feature = posterior.feature if reward_trains_model else posterior.feature.detach()
         reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), reward).mean()
-        loss = kl_loss + image_nll + reward_nll
-        metrics = {"kl_loss": kl_loss, "image_loss": image_nll, "reward_loss": reward_nll, "kl": posterior.kl.mean()}
+        loss = kl_loss + sum(seen_losses.values()) + reward_nll
+        metrics = {"kl_loss": kl_loss, **seen_losses, "reward_loss": reward_nll, "kl": posterior.kl.mean()}
         if self.discount_logit is not None:
-            goes_on = (~is_terminal).to(image.dtype)
+            goes_on = (~is_terminal).to(reward.dtype)
             discount_nll = distributions.bernoulli_nll(self.discount_logit(posterior.feature), goes_on).mean()
             loss = loss + discount_nll
             metrics["discount_loss"] = discount_nll
@@ -106,14 +105,14 @@ class WorldModel(nn.Module):
             metrics["posterior_entropy"] = distributions.categorical_entropy(posterior.post_logits).mean()
         return loss, {name: value.detach() for name, value in metrics.items()}
 
-    def observe(self, image: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> Posterior:
-        """Infer the states behind sequences of images.
+    def observe(self, observation: Observation, action: th.Tensor, is_first: th.Tensor) -> Posterior:
+        """Infer the states behind sequences of observations.
 
-        :param image: float in [-0.5, 0.5], (B, T, C, height, width)
-        :param action: float (B, T, A), the action that led to each image
+        :param observation: preprocessed, (B, T, …)
+        :param action: float (B, T, A), the action that led to each
         :param is_first: bool (B, T)
         """
-        embed = self.encoder(image)
+        embed = self.encoder(observation)
         state, post_logits, prior_logits = self.rssm.observe(embed, action, is_first)
         with th.no_grad():
             kl = distributions.categorical_kl(post_logits, prior_logits)

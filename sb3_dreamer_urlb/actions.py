@@ -1,0 +1,110 @@
+"""What an agent may do: numbers in a box, or choices among classes. Made from the action space.
+
+Inside the agent an action is a float vector, (n, A): numbers in [-1, 1], or one-hot choices one after the other.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+
+
+class Actions(ABC):
+    """One kind of action space."""
+
+    #: A, size of the agent's action vector
+    size: int
+    #: number of classes of each choice; empty for numbers
+    classes: tuple[int, ...] = ()
+
+    @abstractmethod
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        """From the agent's actions, (n, A), to the space's bounds, shape and dtype, (n, …)."""
+
+    @abstractmethod
+    def from_env(self, action: np.ndarray) -> np.ndarray:
+        """From the space's actions, (n, …), to the agent's, float32 (n, A)."""
+
+    @abstractmethod
+    def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
+        """Uniformly random actions of the agent, float (n, A)."""
+
+
+class BoxActions(Actions):
+    """Numbers, scaled from the space's bounds to [-1, 1].
+
+    :param space: with finite bounds
+    :raises UnsupportedSpaceError: if a dimension has no range
+    """
+
+    def __init__(self, space: spaces.Box):
+        if not (space.low < space.high).all():
+            raise UnsupportedSpaceError(
+                f"Every action dimension needs low < high, got {space} with low={space.low}, high={space.high}."
+            )
+        self.space = space
+        self.size = int(np.prod(space.shape))
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        space = self.space
+        scaled = space.low + 0.5 * (action.reshape((-1, *space.shape)) + 1.0) * (space.high - space.low)
+        return np.clip(scaled, space.low, space.high).astype(space.dtype)
+
+    def from_env(self, action: np.ndarray) -> np.ndarray:
+        space = self.space
+        scaled = 2.0 * ((action - space.low) / (space.high - space.low)) - 1.0
+        return scaled.reshape(-1, self.size).astype(np.float32)
+
+    def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
+        return 2 * th.rand((n, self.size), generator=generator, device=device) - 1
+
+
+class ClassActions(Actions):
+    """Choices, one-hot.
+
+    :param space: Discrete or MultiDiscrete of any shape
+    """
+
+    def __init__(self, space: spaces.Discrete | spaces.MultiDiscrete):
+        self.space = space
+        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        self.classes = tuple(np.atleast_1d(counts).flatten().tolist())
+        self.size = sum(self.classes)
+
+    def to_env(self, action: np.ndarray) -> np.ndarray:
+        parts = np.split(action, np.cumsum(self.classes)[:-1], axis=-1)
+        chosen = np.stack([part.argmax(-1) for part in parts], -1)
+        return (chosen.reshape(-1, *self._shape) + self.space.start).astype(self.space.dtype)
+
+    def from_env(self, action: np.ndarray) -> np.ndarray:
+        chosen = th.as_tensor(np.asarray(action) - self.space.start).reshape(-1, len(self.classes)).long()
+        parts = zip(chosen.unbind(-1), self.classes, strict=True)
+        return th.cat([F.one_hot(part, n) for part, n in parts], -1).numpy().astype(np.float32)
+
+    def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
+        return distributions.one_hot_choices(th.ones(n, self.size, device=device), self.classes, generator)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        assert self.space.shape is not None
+        return self.space.shape
+
+
+def make_actions(space: spaces.Space) -> Actions:
+    """The kind of an action space.
+
+    :param space: of the environment
+    :raises UnsupportedSpaceError: if the agent cannot act in it
+    """
+    if isinstance(space, spaces.Box):
+        return BoxActions(space)
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return ClassActions(space)
+    raise UnsupportedSpaceError(f"DreamerV2 needs a Box, Discrete or MultiDiscrete action space, got {space}.")

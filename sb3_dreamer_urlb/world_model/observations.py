@@ -1,0 +1,240 @@
+"""What an agent may see: images, vectors, or several of both by name. Made from the observation space.
+
+Each kind knows how to prepare raw observations for the networks, which encoder and decoder it needs, and how well a
+decoded observation fits. The world model asks these questions and never looks at the space itself.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb.types import Metrics, Observation
+from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, DictDecoder, VectorDecoder
+from sb3_dreamer_urlb.world_model.encoder import ConvEncoder, DictEncoder, Encoder, VectorEncoder
+
+IMAGE_SIZES = (16, 512)
+
+
+class Observations(ABC):
+    """One kind of observation. Raw ones are what the replay holds, any leading shape (…)."""
+
+    @abstractmethod
+    def preprocess(self, raw: Observation) -> Observation:
+        """What the networks see and predict, float32 (…)."""
+
+    @abstractmethod
+    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
+        """From preprocessed observations to embeddings, float (…, ``encoder.embed_size``).
+
+        :param cnn_depth: channels of the first convolution
+        :param net_arch: hidden layers where there is nothing to convolve
+        """
+
+    @abstractmethod
+    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
+        """From features, float (…, F), to the mean of a unit normal over preprocessed observations."""
+
+    @abstractmethod
+    def losses(self, mean: Observation, target: Observation) -> Metrics:
+        """Negative log-likelihood of what was seen, summed over an observation, averaged over them: scalars by name.
+
+        :param mean: decoded
+        :param target: preprocessed
+        """
+
+    def check(self, raw: Observation) -> None:  # noqa: B027 (most kinds take anything)
+        """
+        :param raw: what somebody handed to ``predict``
+        :raises ValueError: if it is no such observation
+        """
+
+
+class Images(Observations):
+    """Images, channels first, scaled from the space's bounds to [-0.5, 0.5].
+
+    :param space: uint8 in [0, 255]; any other dtype and finite bounds if images are not to be normalised
+    :param normalize_images: as everywhere in SB3: False for images that are floats already
+    :raises UnsupportedSpaceError: if it is something else, or has a size the networks do not take
+    """
+
+    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+        if not isinstance(space, spaces.Box) or not is_image_space(space, normalized_image=not normalize_images):
+            raise UnsupportedSpaceError(
+                "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), or floats with "
+                f'policy_kwargs={{"normalize_images": False}}, got {space}. Use "MlpPolicy" for vectors; for dm_control '
+                "tasks use gymnasium.make('urlb/<domain>-<task>-v0')."
+            )
+        low, high = float(space.low.min()), float(space.high.max())
+        if not np.isfinite([low, high]).all():
+            raise UnsupportedSpaceError(f"Images need finite bounds, got {space}.")
+        least, most = IMAGE_SIZES
+        if not is_image_space_channels_first(space):
+            raise UnsupportedSpaceError(
+                f"Images must have their channels first (SB3 transposes an environment's uint8 images only), got {space}."
+            )
+        channels, height, width = space.shape
+        if not (least <= height <= most and least <= width <= most):
+            raise UnsupportedSpaceError(f"Images must be {least} to {most} pixels high and wide, got {height}×{width}.")
+        self.shape = (channels, height, width)
+        self.low, self.range = low, high - low
+        self.dtype = th.uint8 if space.dtype == np.uint8 else None
+
+    def preprocess(self, raw: Observation) -> Observation:
+        assert isinstance(raw, th.Tensor)
+        image = raw if raw.dtype == th.uint8 else raw.to(th.float32)
+        return th.div(image if self.low == 0 else image - self.low, self.range).sub_(0.5)
+
+    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
+        return ConvEncoder(self.shape, cnn_depth)
+
+    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
+        return ConvDecoder(feature_size, self.shape, cnn_depth)
+
+    def losses(self, mean: Observation, target: Observation) -> Metrics:
+        assert isinstance(mean, th.Tensor) and isinstance(target, th.Tensor)
+        return {"image_loss": distributions.image_nll(mean, target)}
+
+    def check(self, raw: Observation) -> None:
+        assert isinstance(raw, th.Tensor)
+        if self.dtype is not None and raw.dtype != self.dtype:
+            raise ValueError(f"Images must be uint8 in [0, 255], got {raw.dtype}.")
+
+
+class Vectors(Observations):
+    """Anything that flattens to a vector."""
+
+    #: of the flattened vector
+    size: int
+
+    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
+        return VectorEncoder(self.size, net_arch)
+
+    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
+        return VectorDecoder(feature_size, net_arch, self.size)
+
+    def losses(self, mean: Observation, target: Observation) -> Metrics:
+        assert isinstance(mean, th.Tensor) and isinstance(target, th.Tensor)
+        return {"vector_loss": distributions.unit_normal_nll(mean, target).sum(-1).mean()}
+
+
+class Numbers(Vectors):
+    """Numbers as they are (Box, MultiBinary); uint8 images divided by 255, as SB3 does.
+
+    :param space: Box or MultiBinary
+    :param normalize_images: divide images
+    """
+
+    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+        assert space.shape is not None
+        self.shape = space.shape
+        self.size = int(np.prod(self.shape))
+        self.scale = 255.0 if normalize_images and is_image_space(space) else 1.0
+
+    def preprocess(self, raw: Observation) -> Observation:
+        assert isinstance(raw, th.Tensor)
+        lead = raw.shape[: raw.dim() - len(self.shape)]
+        return raw.to(th.float32).reshape(*lead, self.size) / self.scale
+
+
+class Classes(Vectors):
+    """Discrete and MultiDiscrete: one-hot vectors, one after the other.
+
+    :param space: Discrete or MultiDiscrete
+    :param normalize_images: unused, every kind of vector is made with it
+    """
+
+    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+        assert isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and space.shape is not None
+        self.shape = space.shape
+        self.classes = np.atleast_1d(space.n if isinstance(space, spaces.Discrete) else space.nvec).flatten().tolist()
+        self.start = np.broadcast_to(space.start, self.shape).flatten().tolist()
+        self.size = sum(self.classes)
+
+    def preprocess(self, raw: Observation) -> Observation:
+        assert isinstance(raw, th.Tensor)
+        lead = raw.shape[: raw.dim() - len(self.shape)]
+        numbers = raw.reshape(*lead, len(self.classes)).long().unbind(-1)
+        parts = zip(numbers, self.classes, self.start, strict=True)
+        return th.cat([F.one_hot(number - start, n) for number, n, start in parts], -1).to(th.float32)
+
+
+#: what each space is to ``MlpPolicy``
+VECTORS: dict[type[spaces.Space], type[Numbers] | type[Classes]] = {
+    spaces.Box: Numbers,
+    spaces.MultiBinary: Numbers,
+    spaces.Discrete: Classes,
+    spaces.MultiDiscrete: Classes,
+}
+
+
+def vectors(space: spaces.Space, normalize_images: bool = True) -> Vectors:
+    """The kind of an observation space that is flattened.
+
+    :param space: of the environment
+    :param normalize_images: divide uint8 images by 255
+    :raises UnsupportedSpaceError: if it cannot be flattened
+    """
+    for known, kind in VECTORS.items():
+        if isinstance(space, known):
+            return kind(space, normalize_images)
+    names = ", ".join(known.__name__ for known in VECTORS)
+    raise UnsupportedSpaceError(f"MlpPolicy needs one of the observation spaces {names}, got {space}.")
+
+
+class DictObservations(Observations):
+    """Several observations by name. Embeddings are concatenated, losses of one kind are summed.
+
+    :param space: Dict of images and of what :func:`vectors` takes
+    :param normalize_images: see :class:`Images`
+    :raises UnsupportedSpaceError: for another space, or if one of its spaces does not fit
+    """
+
+    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+        if not isinstance(space, spaces.Dict) or len(space.spaces) == 0:
+            raise UnsupportedSpaceError(f"MultiInputPolicy needs a Dict of observations, got {space}.")
+        self.parts: dict[str, Observations] = {}
+        for key, part in space.spaces.items():
+            image = is_image_space(part, normalized_image=not normalize_images)
+            try:
+                self.parts[key] = Images(part, normalize_images) if image else vectors(part, normalize_images)
+            except UnsupportedSpaceError as error:
+                raise UnsupportedSpaceError(f"Observation {key!r}: {error}") from error
+
+    def preprocess(self, raw: Observation) -> Observation:
+        assert isinstance(raw, dict)
+        prepared: dict[str, th.Tensor] = {}
+        for key, part in self.parts.items():
+            prepared[key] = part.preprocess(raw[key])  # type: ignore[assignment]
+        return prepared
+
+    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
+        return DictEncoder({key: part.make_encoder(cnn_depth, net_arch) for key, part in self.parts.items()})
+
+    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
+        return DictDecoder({key: part.make_decoder(feature_size, cnn_depth, net_arch) for key, part in self.parts.items()})
+
+    def losses(self, mean: Observation, target: Observation) -> Metrics:
+        assert isinstance(mean, dict) and isinstance(target, dict)
+        total: Metrics = {}
+        for key, part in self.parts.items():
+            for name, loss in part.losses(mean[key], target[key]).items():
+                total[name] = total[name] + loss if name in total else loss
+        return total
+
+    def check(self, raw: Observation) -> None:
+        assert isinstance(raw, dict)
+        missing = sorted(set(self.parts) - set(raw))
+        if missing:
+            raise ValueError(f"The observation lacks {missing}; it has {sorted(raw)}.")
+        for key, part in self.parts.items():
+            part.check(raw[key])
