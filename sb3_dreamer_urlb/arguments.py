@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.precision import PRECISIONS
@@ -66,9 +66,7 @@ def check(model: DreamerV2) -> None:
     :raises ValueError: naming the argument, its value and what was expected
     """
     for name, least in INTEGERS.items():
-        value = getattr(model, name)
-        if not is_integer(value) or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
+        check_integer(name, getattr(model, name), least)
     for name, (low, low_ok, high, high_ok) in NUMBERS.items():
         value = getattr(model, name)
         inside = is_number(value) and (low < value < high or (low_ok and value == low) or (high_ok and value == high))

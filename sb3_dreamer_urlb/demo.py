@@ -13,7 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation import figures
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
-from sb3_dreamer_urlb.evaluation.scores import ORACLE
+from sb3_dreamer_urlb.evaluation.scores import oracle
+from sb3_dreamer_urlb.number_checks import check_positive
 from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
 
 
@@ -46,11 +47,8 @@ class DemoConfig:
     keep_actor: bool | None = False
 
     def __post_init__(self) -> None:
-        if self.task not in ORACLE:
-            raise ValueError(f"Unknown task {self.task!r}; known are {sorted(ORACLE)}.")
-        for name in ("pretrain_frames", "finetune_frames", "episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        oracle(self.task)
+        check_positive(self, "pretrain_frames", "finetune_frames", "episodes")
 
 
 class EpisodeRecorder(BaseCallback):
@@ -87,7 +85,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     result = {
         "fine-tuned agent": float(np.mean(returns)),
         "random policy": float(np.mean(random_returns)),
-        "oracle": ORACLE[config.task],
+        "oracle": oracle(config.task),
     }
     _draw(config, model, env, recorder, result)
     env.close()

@@ -19,8 +19,9 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
-from sb3_dreamer_urlb.evaluation.scores import ORACLE
+from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward, registered_intrinsic_rewards
+from sb3_dreamer_urlb.number_checks import check_positive
 from sb3_dreamer_urlb.presets import get_preset
 
 COLUMNS = ("method", "updates", "intrinsic reward", "spread", "module's loss", "fine-tuned", "minutes", "")
@@ -55,16 +56,13 @@ class TourConfig:
     log_every: int = 100
 
     def __post_init__(self) -> None:
-        if self.task not in ORACLE:
-            raise ValueError(f"Unknown task {self.task!r}; known are {sorted(ORACLE)}.")
+        oracle(self.task)
         get_preset(self.preset)
         known = registered_intrinsic_rewards()
         unknown = sorted(set(self.methods) - set(known))
         if unknown:
             raise ValueError(f"Unknown methods {unknown}; known are {sorted(known)}.")
-        for name in ("pretrain_frames", "finetune_frames", "episodes", "jobs", "log_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}.")
+        check_positive(self, "pretrain_frames", "finetune_frames", "episodes", "jobs", "log_every")
 
 
 @dataclass

@@ -20,3 +20,25 @@ def is_number(value: Any) -> bool:
 def is_finite_number(value: Any) -> bool:
     """Whether ``value`` is a real number, neither NaN nor infinite."""
     return is_number(value) and math.isfinite(value)
+
+
+def check_integer(name: str, value: Any, least: int) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :param least: smallest allowed value
+    :raises ValueError: if ``value`` is no integer, or smaller
+    """
+    if not is_integer(value) or value < least:
+        raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
+
+
+def check_positive(owner: Any, *names: str) -> None:
+    """
+    :param owner: whose attributes to check
+    :param names: of the attributes
+    :raises ValueError: for one below 1
+    """
+    for name in names:
+        if getattr(owner, name) < 1:
+            raise ValueError(f"{name} must be positive, got {getattr(owner, name)}.")

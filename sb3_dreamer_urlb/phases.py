@@ -194,6 +194,10 @@ class FineTuneCallback(BaseCallback):
         model.restart_episodes()
 
 
+#: when the paper saves its pre-trained agents, in environment frames
+SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
+
+
 class SnapshotCallback(BaseCallback):
     """Save the pre-training agent whenever it has seen given numbers of frames (paper §2).
 
@@ -209,7 +213,7 @@ class SnapshotCallback(BaseCallback):
     def __init__(
         self,
         save_path: str | os.PathLike[str],
-        frames: Sequence[int] = (100_000, 500_000, 1_000_000, 2_000_000),
+        frames: Sequence[int] = SNAPSHOT_FRAMES,
         name_prefix: str = "snapshot",
         verbose: int = 0,
     ):

@@ -26,6 +26,15 @@ def normalized_score(task: str, episode_return: float) -> float:
     :param episode_return: undiscounted return of one episode, or a mean of such
     :raises ValueError: for an unknown task
     """
+    return episode_return / oracle(task)
+
+
+def oracle(task: str) -> float:
+    """Return of the oracle.
+
+    :param task: ``<domain>-<task>``, a key of ``ORACLE``
+    :raises ValueError: for an unknown task
+    """
     if task not in ORACLE:
         raise ValueError(f"Unknown task {task!r}; known are {sorted(ORACLE)}.")
-    return episode_return / ORACLE[task]
+    return ORACLE[task]

@@ -10,7 +10,7 @@ import torch as th
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.number_checks import check_integer
 
 #: numbers of the largest temporary tensor: on a CPU few, which stay in its caches; a GPU wants few, large kernels
 _CHUNK_NUMBERS = {"cpu": 2**23, "cuda": 2**25}
@@ -26,8 +26,7 @@ def check_neighbours(k: int, particles: int | None = None) -> None:
     :param particles: how many there are, None if that is not known yet
     :raises ValueError: if k is no integer between 1 and the number of particles
     """
-    if not is_integer(k) or k < 1:
-        raise ValueError(f"k must be an integer of at least 1, got {k!r}.")
+    check_integer("k", k, 1)
     if particles is not None and k > particles:
         raise ValueError(f"k must be at most the number of particles, but k is {k} and there are {particles} particles.")
 

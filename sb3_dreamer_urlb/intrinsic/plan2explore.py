@@ -7,7 +7,7 @@ from torch import nn
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
 from sb3_dreamer_urlb.nets import ReLUNet
-from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
 
@@ -20,8 +20,7 @@ class Plan2Explore(IntrinsicReward):
 
     def __init__(self, ensemble_size: int = 5):
         super().__init__()
-        if not is_integer(ensemble_size) or ensemble_size < 2:
-            raise ValueError(f"ensemble_size must be an integer of at least 2, got {ensemble_size!r}.")
+        check_integer("ensemble_size", ensemble_size, 2)
         self.ensemble_size = ensemble_size
 
     def build(self, sizes: ModelSizes) -> None:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.number_checks import check_integer
 
 
 class Skills(nn.Module):
@@ -26,8 +26,7 @@ class Skills(nn.Module):
     def __init__(self, dim: int, interval: int = 50):
         super().__init__()
         for name, value, least in (("skill_dim", dim, 2), ("skill_interval", interval, 1)):
-            if not is_integer(value) or value < least:
-                raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
+            check_integer(name, value, least)
         self.dim = dim
         self.interval = interval
         # Zeros mean that none is fixed: no skill of any space is zero.

@@ -50,8 +50,7 @@ class CategoricalDynaMPC(DynaMPC):
             probs = self._mixed(self._refine(probs, elites, weight)[0])
         if explore:
             return self._draw(probs[:, 0], generator), probs
-        chosen = distributions.draw_classes(weight, generator)
-        return elites[th.arange(len(elites), device=elites.device), chosen, 0], probs
+        return self._draw_elite(elites, weight, generator), probs
 
     def _mixed(self, probs: th.Tensor) -> th.Tensor:
         """Uniform where nothing is known, and a little everywhere: (…, A)."""

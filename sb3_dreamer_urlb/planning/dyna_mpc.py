@@ -12,7 +12,7 @@ import torch as th
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.behavior.returns import lambda_return
-from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
+from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number
 from sb3_dreamer_urlb.types import LatentState
 
 MAX_STD = 2.0
@@ -64,9 +64,7 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         for name, least in (("horizon", 2), ("n_samples", 1), ("iterations", 1), ("top_k", 1)):
-            value = getattr(self, name)
-            if not is_integer(value) or value < least:
-                raise ValueError(f"planner {name} must be an integer of at least {least}, got {value!r}.")
+            check_integer(f"planner {name}", getattr(self, name), least)
         for name in ("mixture", "temperature", "momentum", "min_std"):
             value = getattr(self, name)
             if not is_finite_number(value):
@@ -133,8 +131,7 @@ class DynaMPC:
             value = self._evaluate(model, trajectories, actions, generator)
             elites, weight = self._elites(actions, value)
             mean, std = self._refine(mean, elites, weight)
-        chosen = distributions.draw_classes(weight, generator)
-        action = elites[th.arange(len(elites), device=elites.device), chosen, 0]
+        action = self._draw_elite(elites, weight, generator)
         if explore:
             action = action + std[:, 0] * self._exploration_noise(action, generator)
         return action.clamp(-1, 1), mean
@@ -174,6 +171,12 @@ class DynaMPC:
         best, index = value.topk(self.config.top_k, dim=1)
         elites = actions.gather(1, index[:, :, None, None].expand(-1, -1, *actions.shape[2:]))
         return elites, (self.config.temperature * best).softmax(1)
+
+    @staticmethod
+    def _draw_elite(elites: th.Tensor, weight: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """The first action of one elite, drawn by its weight, float (n, A)."""
+        chosen = distributions.draw_classes(weight, generator)
+        return elites[th.arange(len(elites), device=elites.device), chosen, 0]
 
     def _refine(self, mean: th.Tensor, elites: th.Tensor, weight: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Weighted mean and standard deviation of the elites (paper, equation 2), both float (n, H, A)."""

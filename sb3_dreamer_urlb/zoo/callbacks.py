@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_dreamer_urlb.phases import SnapshotCallback
+from sb3_dreamer_urlb.phases import SNAPSHOT_FRAMES, SnapshotCallback
 
 
 class RunSnapshotCallback(SnapshotCallback):
@@ -24,7 +24,7 @@ class RunSnapshotCallback(SnapshotCallback):
 
     def __init__(
         self,
-        frames: Sequence[int] = (100_000, 500_000, 1_000_000, 2_000_000),
+        frames: Sequence[int] = SNAPSHOT_FRAMES,
         name_prefix: str = "snapshot",
         verbose: int = 1,
     ):
