@@ -9,10 +9,10 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from gymnasium import spaces
 
 from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.choices import classes_of, one_hot_numbers
 from sb3_dreamer_urlb.errors import UnsupportedSpaceError
 
 
@@ -74,8 +74,7 @@ class ClassActions(Actions):
 
     def __init__(self, space: spaces.Discrete | spaces.MultiDiscrete):
         self.space = space
-        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        self.classes = tuple(np.atleast_1d(counts).flatten().tolist())
+        self.classes = classes_of(space)
         self.size = sum(self.classes)
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
@@ -84,9 +83,8 @@ class ClassActions(Actions):
         return (chosen.reshape(-1, *self._shape) + self.space.start).astype(self.space.dtype)
 
     def from_env(self, action: np.ndarray) -> np.ndarray:
-        chosen = th.as_tensor(np.asarray(action) - self.space.start).reshape(-1, len(self.classes)).long()
-        parts = zip(chosen.unbind(-1), self.classes, strict=True)
-        return th.cat([F.one_hot(part, n) for part, n in parts], -1).numpy().astype(np.float32)
+        chosen = th.as_tensor(np.asarray(action) - self.space.start).reshape(-1, len(self.classes))
+        return one_hot_numbers(chosen, self.classes).numpy()
 
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
         return distributions.one_hot_choices(th.ones(n, self.size, device=device), self.classes, generator)

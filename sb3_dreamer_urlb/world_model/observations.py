@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.choices import classes_of, one_hot_numbers
 from sb3_dreamer_urlb.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.types import Metrics, Observation
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, DictDecoder, VectorDecoder
@@ -156,16 +156,15 @@ class Classes(Vectors):
     def __init__(self, space: spaces.Space, normalize_images: bool = True):
         assert isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and space.shape is not None
         self.shape = space.shape
-        self.classes = np.atleast_1d(space.n if isinstance(space, spaces.Discrete) else space.nvec).flatten().tolist()
-        self.start = np.broadcast_to(space.start, self.shape).flatten().tolist()
+        self.classes = classes_of(space)
+        self.start = th.as_tensor(np.broadcast_to(space.start, self.shape).flatten().astype(np.int64))
         self.size = sum(self.classes)
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
         lead = raw.shape[: raw.dim() - len(self.shape)]
-        numbers = raw.reshape(*lead, len(self.classes)).long().unbind(-1)
-        parts = zip(numbers, self.classes, self.start, strict=True)
-        return th.cat([F.one_hot(number - start, n) for number, n, start in parts], -1).to(th.float32)
+        numbers = raw.reshape(*lead, len(self.classes)).long()
+        return one_hot_numbers(numbers - self.start.to(raw.device), self.classes)
 
 
 #: what each space is to ``MlpPolicy``
