@@ -137,7 +137,7 @@ def observation_of(columns: dict[str, np.ndarray]) -> RawObservation:
     return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}
 
 
-def _zeros(space: spaces.Space) -> np.ndarray:
+def _zeros(space: spaces.Space[Any]) -> np.ndarray:
     assert space.shape is not None
     return np.zeros(space.shape, space.dtype)
 
@@ -168,8 +168,8 @@ class SequenceReplayBuffer(ReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
         device: th.device | str = "auto",
         n_envs: int = 1,
         *,
@@ -264,7 +264,7 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def add(  # type: ignore[override]
+    def add(
         self,
         obs: RawObservation,
         next_obs: RawObservation,
