@@ -22,7 +22,8 @@ from sb3_dreamer_urlb.intrinsic import registry
 from sb3_dreamer_urlb.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").rglob("*.md"))]
+OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]
+PAGES = [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
 # What makes an example small: numbers of frames and steps.
 SMALL = {
@@ -205,3 +206,4 @@ def pages_and_code_come_from_outside_of_docs(site):
     assert 'href="concepts/"' in start and 'src="images/learning_curve.png"' in start
     code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
     assert "class LBS" in re.sub(r"<[^>]*>", "", code)
+    assert "PRETRAIN_FRAMES" in (site / "quickstart/index.html").read_text()
