@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
-from sb3_dreamer_urlb import arguments, env_steps, numerical_faults, phases, run_folder
+from sb3_dreamer_urlb import arguments, numerical_faults, phases
+from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
-from sb3_dreamer_urlb.envs.faults import check_finite_action
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
@@ -30,15 +26,13 @@ from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, Mlp
 from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.run_folder import RunFolder
-from sb3_dreamer_urlb.snapshots import model as model_snapshot
-from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
-from sb3_dreamer_urlb.snapshots.archive import Target
+from sb3_dreamer_urlb.saving import SavingAlgorithm
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
 
 
-class DreamerV2(OffPolicyAlgorithm):
+class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     """DreamerV2 with unsupervised pre-training, task-aware fine-tuning and Dyna-MPC.
 
     "Mastering the Unsupervised Reinforcement Learning Benchmark from Pixels" (ICML 2023). With an ``intrinsic_reward``
@@ -102,10 +96,7 @@ class DreamerV2(OffPolicyAlgorithm):
         "MlpPolicy": MlpPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    policy: DreamerPolicy
     policy_class: type[DreamerPolicy]
-    replay_buffer: SequenceReplayBuffer
-    learner: Learner
 
     @with_preset
     def __init__(
@@ -237,15 +228,6 @@ class DreamerV2(OffPolicyAlgorithm):
         self._convert_train_freq()
         self._read_env()
 
-    def _read_env(self) -> None:
-        """What the environment tells about itself beyond its spaces."""
-        if self.env is None:
-            return
-        self.action_repeat = int(arguments.env_attribute(self.env, "action_repeat", 1))
-        self.domain = arguments.env_attribute(self.env, "domain", None)
-        if self.discount_head is None:
-            self.discount_head = not arguments.env_attribute(self.env, "never_terminates", False)
-
     def _build(self) -> None:
         """Fresh networks, optimisers and replay for the current phase."""
         intrinsic = self._intrinsic()
@@ -370,111 +352,6 @@ class DreamerV2(OffPolicyAlgorithm):
             posterior = model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)
             agent.intrinsic.skills.fix(agent.intrinsic.choose_skill(agent.actor, posterior, batch))
 
-    def restart_episodes(self) -> None:
-        """Reset all environments in the middle of ``learn``, because they changed."""
-        assert self.env is not None
-        self.replay_buffer.close_streams()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
-        self._last_episode_starts = np.ones(self.env.num_envs, bool)
-
-    def prepare_env(self, env: GymEnv) -> VecEnv:
-        """Wrap an environment as SB3 does, and check that this model can go on in it.
-
-        :param env: vectorised or not
-        :raises ValueError: if it does not fit
-        """
-        wrapped = self._wrap_env(env, self.verbose)
-        arguments.check_env(self, wrapped)
-        return wrapped
-
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As SB3's; also checks that episodes are long enough, and reads the new environment's action repeat.
-
-        :param env: with the model's number of environments and its spaces
-        :param force_reset: reset it before going on
-        :raises ValueError: if it does not fit; the model stays as it is
-        """
-        super().set_env(self.prepare_env(env), force_reset)
-        self._read_env()
-
-    # -- acting --------------------------------------------------------------------------------------------------------
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """See :meth:`DreamerPolicy.predict`; plans if a planner is set and its time has come."""
-        self.policy.planning = self._planner_is_on()
-        return self.policy.predict(observation, state, episode_start, deterministic)
-
-    def _planner_is_on(self) -> bool:
-        due = self.phase_timesteps >= self.learning_starts + self.planner_delay
-        return self.planner is not None and phases.PHASES[self.phase].plans and due and self.policy.agent.trains_behavior()
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """One step of the recurrent agent; what it remembers is the action *as executed*."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        state = self._acting_state or self.policy.initial_state(n_envs)
-        self.policy.planning = self._planner_is_on()
-        with th.no_grad():
-            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
-            if phases.PHASES[self.phase].random_warmup and self.phase_timesteps < learning_starts:
-                uniform = np.stack([self.action_space.sample() for _ in range(n_envs)])
-                scaled = self.policy.actions.from_env(uniform)
-            else:
-                state = self.policy.choose(state, deterministic=False)
-                scaled = state.action.cpu().numpy()
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise().reshape(n_envs, -1), -1, 1)
-        check_finite_action(scaled, "The policy", self.num_timesteps)
-        scaled = scaled.astype(np.float32)
-        state.action = th.as_tensor(scaled, device=self.device)
-        self._acting_state = state
-        self.phase_timesteps += n_envs
-        self.phase_frames += n_envs * self.action_repeat
-        return self.policy.to_env_action(scaled), scaled
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
-        normalizer = self._vec_normalize_env
-        if normalizer is None:
-            self._last_original_obs, original_obs = self._last_obs, new_obs  # type: ignore[assignment]
-        else:
-            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
-        self.env_faults += env_steps.count_faults(infos)
-        # The VecEnv has already begun the next episode: put the true last observation back.
-        next_obs = copy.deepcopy(original_obs)
-        for i in np.flatnonzero(dones):
-            if (last := infos[i].get("terminal_observation")) is not None:
-                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
-        env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        assert self._acting_state is not None
-        skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
-        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
-        self._last_obs, self._last_original_obs = new_obs, original_obs  # type: ignore[assignment]
-        self._last_episode_starts = dones.astype(bool)
-
-    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
-        """The last observation before normalisation, with channels first as the model sees it."""
-        original = normalizer.get_original_obs()
-        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
-
     # -- learning ------------------------------------------------------------------------------------------------------
 
     def learn(
@@ -575,123 +452,3 @@ class DreamerV2(OffPolicyAlgorithm):
         self.logger.record("time/phase", self.phase, exclude="tensorboard")
         self.logger.record("time/phase_frames", self.phase_frames)
         super().dump_logs()
-
-    # -- saving --------------------------------------------------------------------------------------------------------
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
-        return ["policy", *optimizers], []
-
-    def save(  # type: ignore[override]
-        self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
-        """Write the model, without replay and environment, in a form that can never run code.
-
-        :param path: path (``.zip`` is added where it has no suffix; written atomically), or binary file object
-        :param exclude: part of SB3's interface; a snapshot is always whole
-        :param include: likewise
-        :raises ValueError: for ``exclude`` or ``include``, or if a weight is not finite; the old file stays
-        :raises OSError: naming the path; the old file stays
-        """
-        if exclude or include:
-            raise ValueError("A snapshot is always whole: save() takes neither exclude nor include.")
-        model_snapshot.save(self, path)
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfDreamerV2],
-        path: Target,
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfDreamerV2:
-        """Read what :meth:`save` wrote. No code ever runs from a file, whoever made it.
-
-        A model with a ``seed`` goes on with the random states of the file, one without draws anew.
-
-        :param path: of the ``.zip``, or a binary file object
-        :param env: environment to go on in
-        :param device: where to put the networks
-        :param custom_objects: arguments that replace the stored ones, needed for those that no file can hold: functions as
-            learning rates, classes that are not registered; unknown names are ignored, as SB3 does
-        :param print_system_info: print those of the file and of this machine
-        :param force_reset: part of SB3's interface; the environment is always reset
-        :param kwargs: constructor arguments to change; a new ``seed`` also draws anew
-        :raises TypeError: for a keyword that is no constructor argument
-        :raises SnapshotError: naming the file and why it is refused
-        """
-        arguments.check_load_keywords(cls, kwargs)
-        return model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
-
-    @classmethod
-    def resume(
-        cls: type[SelfDreamerV2],
-        folder: str | os.PathLike[str],
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ) -> SelfDreamerV2 | None:
-        """Go on with a run that a :class:`~sb3_dreamer_urlb.RunCheckpointCallback` kept, replay included.
-
-        Continue with ``learn(total - model.num_timesteps, reset_num_timesteps=False)``.
-
-        :param folder: of the run
-        :param env: environment to go on in
-        :param device: see :meth:`load`
-        :param custom_objects: see :meth:`load`
-        :param kwargs: see :meth:`load`
-        :return: the model as of the last checkpoint, random states included; None if there is none yet
-        :raises SnapshotError: naming the file and why it is refused
-        :raises RuntimeError: if the run is still going
-        """
-        arguments.check_load_keywords(cls, kwargs)
-        return run_folder.resume(
-            cls, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
-        )
-
-    def set_parameters(  # type: ignore[override]
-        self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """Take over weights and the optimisers' moments.
-
-        :param load_path_or_dict: what :meth:`save` wrote, or what :meth:`get_parameters` gave
-        :param exact_match: False takes what both have
-        :param device: part of SB3's interface; the parameters stay where they are
-        :raises SnapshotError: naming the file and why it is refused; the model stays as it is
-        """
-        if isinstance(load_path_or_dict, dict):
-            super().set_parameters(load_path_or_dict, exact_match, device)
-        else:
-            model_snapshot.set_parameters(self, load_path_or_dict, exact_match)
-
-    def save_replay_buffer(self, path: Target) -> None:  # type: ignore[override]
-        """Write the replay, open episodes included, in a form that can never run code.
-
-        :param path: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
-        """
-        replay_snapshot.save(self.replay_buffer, path)
-
-    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
-        """Go on with a saved replay buffer.
-
-        :param path: what :meth:`save_replay_buffer` wrote
-        :param truncate_last_traj: part of SB3's interface; open episodes are always ended
-        :raises SnapshotError: if the file is damaged, does not fit the model, or was filled in another phase; the model
-            keeps its own then
-        """
-        buffer = self._new_replay_buffer()
-        replay_snapshot.load(buffer, path)
-        self.replay_buffer = buffer
-
-
-def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:
-    """Replace the observation of environment ``i``."""
-    if isinstance(observations, dict):
-        for name, values in observations.items():
-            values[i] = observation[name]  # type: ignore[call-overload]
-    else:
-        observations[i] = observation

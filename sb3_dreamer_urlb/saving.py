@@ -1,0 +1,149 @@
+"""What the algorithm keeps in files, and takes from them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_dreamer_urlb import arguments, run_folder
+from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.snapshots import model as model_snapshot
+from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
+from sb3_dreamer_urlb.snapshots.archive import Target
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+SelfSavingAlgorithm = TypeVar("SelfSavingAlgorithm", bound="SavingAlgorithm")
+
+
+class SavingAlgorithm(OffPolicyAlgorithm):
+    """The part of :class:`~sb3_dreamer_urlb.DreamerV2` that saves and loads."""
+
+    learner: Learner
+    replay_buffer: SequenceReplayBuffer
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
+        return ["policy", *optimizers], []
+
+    def save(  # type: ignore[override]
+        self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """Write the model, without replay and environment, in a form that can never run code.
+
+        :param path: path (``.zip`` is added where it has no suffix; written atomically), or binary file object
+        :param exclude: part of SB3's interface; a snapshot is always whole
+        :param include: likewise
+        :raises ValueError: for ``exclude`` or ``include``, or if a weight is not finite; the old file stays
+        :raises OSError: naming the path; the old file stays
+        """
+        if exclude or include:
+            raise ValueError("A snapshot is always whole: save() takes neither exclude nor include.")
+        model_snapshot.save(_whole(self), path)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfSavingAlgorithm],
+        path: Target,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfSavingAlgorithm:
+        """Read what :meth:`save` wrote. No code ever runs from a file, whoever made it.
+
+        A model with a ``seed`` goes on with the random states of the file, one without draws anew.
+
+        :param path: of the ``.zip``, or a binary file object
+        :param env: environment to go on in
+        :param device: where to put the networks
+        :param custom_objects: arguments that replace the stored ones, needed for those that no file can hold: functions as
+            learning rates, classes that are not registered; unknown names are ignored, as SB3 does
+        :param print_system_info: print those of the file and of this machine
+        :param force_reset: part of SB3's interface; the environment is always reset
+        :param kwargs: constructor arguments to change; a new ``seed`` also draws anew
+        :raises TypeError: for a keyword that is no constructor argument
+        :raises SnapshotError: naming the file and why it is refused
+        """
+        whole: Any = cls
+        arguments.check_load_keywords(whole, kwargs)
+        return model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)[0]
+
+    @classmethod
+    def resume(
+        cls: type[SelfSavingAlgorithm],
+        folder: str | os.PathLike[str],
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> SelfSavingAlgorithm | None:
+        """Go on with a run that a :class:`~sb3_dreamer_urlb.RunCheckpointCallback` kept, replay included.
+
+        Continue with ``learn(total - model.num_timesteps, reset_num_timesteps=False)``.
+
+        :param folder: of the run
+        :param env: environment to go on in
+        :param device: see :meth:`load`
+        :param custom_objects: see :meth:`load`
+        :param kwargs: see :meth:`load`
+        :return: the model as of the last checkpoint, random states included; None if there is none yet
+        :raises SnapshotError: naming the file and why it is refused
+        :raises RuntimeError: if the run is still going
+        """
+        whole: Any = cls
+        arguments.check_load_keywords(whole, kwargs)
+        return run_folder.resume(
+            whole, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
+        )
+
+    def set_parameters(  # type: ignore[override]
+        self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """Take over weights and the optimisers' moments.
+
+        :param load_path_or_dict: what :meth:`save` wrote, or what :meth:`get_parameters` gave
+        :param exact_match: False takes what both have
+        :param device: part of SB3's interface; the parameters stay where they are
+        :raises SnapshotError: naming the file and why it is refused; the model stays as it is
+        """
+        if isinstance(load_path_or_dict, dict):
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        else:
+            model_snapshot.set_parameters(_whole(self), load_path_or_dict, exact_match)
+
+    def save_replay_buffer(self, path: Target) -> None:  # type: ignore[override]
+        """Write the replay, open episodes included, in a form that can never run code.
+
+        :param path: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
+        """
+        replay_snapshot.save(self.replay_buffer, path)
+
+    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
+        """Go on with a saved replay buffer.
+
+        :param path: what :meth:`save_replay_buffer` wrote
+        :param truncate_last_traj: part of SB3's interface; open episodes are always ended
+        :raises SnapshotError: if the file is damaged, does not fit the model, or was filled in another phase; the model
+            keeps its own then
+        """
+        buffer = self._new_replay_buffer()
+        replay_snapshot.load(buffer, path)
+        self.replay_buffer = buffer
+
+    def _new_replay_buffer(self) -> SequenceReplayBuffer:
+        raise NotImplementedError
+
+
+def _whole(part: SavingAlgorithm) -> DreamerV2:
+    """The algorithm that this is a part of; said to the type checker alone."""
+    return cast("DreamerV2", part)
