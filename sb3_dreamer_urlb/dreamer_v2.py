@@ -283,7 +283,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
         buffer_class: Any = self.replay_buffer_class or SequenceReplayBuffer
-        return buffer_class(
+        buffer: SequenceReplayBuffer = buffer_class(
             self.buffer_size,
             self.observation_space,
             self.action_space,
@@ -297,6 +297,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
                 **self.replay_buffer_kwargs,
             },
         )
+        return buffer
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -410,7 +411,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             self.replay_buffer.close_streams()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
         return result
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
