@@ -8,6 +8,7 @@ import pytest
 
 nbformat = pytest.importorskip("nbformat", reason="needs the extra notebook")
 nbclient = pytest.importorskip("nbclient", reason="needs the extra notebook")
+pytest.importorskip("ipykernel", reason="needs the extra notebook")
 
 NOTEBOOK = Path(__file__).parent.parent / "examples" / "quickstart.ipynb"
 # Two whole episodes of pre-training, two of fine-tuning.
@@ -23,7 +24,9 @@ def notebook():
     return nbformat.read(NOTEBOOK, as_version=4)
 
 
-def test_it_runs(notebook, tmp_path):
+def test_it_runs(notebook, tmp_path, monkeypatch):
+    for name in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR"):  # else in the home folder
+        monkeypatch.setenv(name, str(tmp_path / name))
     [sizes] = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", ())]
     sizes.source = SIZES
     nbclient.NotebookClient(notebook, timeout=200, resources={"metadata": {"path": tmp_path}}).execute()
