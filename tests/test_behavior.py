@@ -108,7 +108,7 @@ def test_behaviour_changes_actor_and_critic_only(learner, batch, weights, intrin
     posterior = infer(its.agent.world_model, batch)
     before = {name: weights(module) for name, module in its.agent.named_children()}
     its.updates = 1  # no slow copy
-    its._update_behavior(posterior.state.detach())
+    its._update_behavior(posterior.state.detach(), batch.is_terminal)
     changed = {name for name, module in its.agent.named_children() if weights(module) != before[name]}
     # LBS normalises its rewards, the task does not.
     assert changed == {"actor", "critic"} | ({"reward_normalizer"} if intrinsic else set())
@@ -151,7 +151,7 @@ def test_actor_climbs_the_imagined_reward(learner, batch, sign):
 
     def imagined(actor_learning_rate, updates):
         its.actor_optimizer.set_learning_rate(actor_learning_rate)
-        return th.stack([its._update_behavior(state)["imagined_reward"] for _ in range(updates)])
+        return th.stack([its._update_behavior(state, batch.is_terminal)["imagined_reward"] for _ in range(updates)])
 
     before = imagined(0.0, 40)
     imagined(1e-2, 150)
