@@ -41,7 +41,6 @@ NUMBERS = {
     "kl_balance": (0.0, True, 1.0, True),
     "free_nats": (0.0, True, math.inf, False),
     "kl_scale": (0.0, True, math.inf, False),
-    "discount_scale": (0.0, True, math.inf, False),
     "adam_eps": (0.0, False, math.inf, False),
     "max_grad_norm": (0.0, False, math.inf, True),
     "weight_decay": (0.0, True, 1.0, False),

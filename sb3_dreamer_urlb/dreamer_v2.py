@@ -77,7 +77,6 @@ class DreamerV2(OffPolicyAlgorithm):
     :param free_nats: the KL that costs nothing
     :param kl_balance: share of the KL's gradient that trains the prior
     :param kl_scale: weight of the KL in the model's loss
-    :param discount_scale: weight of the discount head in the model's loss
     :param actor_gradient: ``"dynamics"``: through the model, straight through where actions are one-hot; ``"reinforce"``: by
         the score function, for Discrete and MultiDiscrete actions; ``"auto"``: REINFORCE for these, dynamics for Box (as
         DreamerV2)
@@ -140,7 +139,6 @@ class DreamerV2(OffPolicyAlgorithm):
         free_nats: float = 1.0,
         kl_balance: float = 0.8,
         kl_scale: float = 1.0,
-        discount_scale: float = 1.0,
         actor_gradient: str = AUTO,
         target_update_interval: int = 100,
         adam_eps: float = 1e-5,
@@ -197,7 +195,6 @@ class DreamerV2(OffPolicyAlgorithm):
         self.free_nats = free_nats
         self.kl_balance = kl_balance
         self.kl_scale = kl_scale
-        self.discount_scale = discount_scale
         self.actor_gradient = actor_gradient
         self.target_update_interval = target_update_interval
         self.adam_eps = adam_eps
@@ -304,7 +301,6 @@ class DreamerV2(OffPolicyAlgorithm):
             free_nats=self.free_nats,
             kl_balance=self.kl_balance,
             kl_scale=self.kl_scale,
-            discount_scale=self.discount_scale,
             actor_gradient=choose_gradient(self.actor_gradient, make_actions(self.action_space).classes),
             imagination_horizon=self.imagination_horizon,
             gae_lambda=self.gae_lambda,

@@ -43,7 +43,6 @@ class LearnerConfig:
     reward_trains_model: bool
     precision: str = "float32"
     kl_scale: float = 1.0
-    discount_scale: float = 1.0
     actor_gradient: str = DYNAMICS
 
 
@@ -147,7 +146,6 @@ class Learner:
                 config.kl_balance,
                 config.reward_trains_model,
                 config.kl_scale,
-                config.discount_scale,
             )
         if reward is not batch.reward:
             metrics["intrinsic_replay_reward"] = reward.mean()

@@ -78,7 +78,6 @@ class WorldModel(nn.Module):
         kl_balance: float,
         reward_trains_model: bool,
         kl_scale: float = 1.0,
-        discount_scale: float = 1.0,
     ) -> tuple[th.Tensor, Metrics]:
         """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
 
@@ -90,7 +89,6 @@ class WorldModel(nn.Module):
         :param kl_balance: share of the KL's gradient that trains the prior
         :param reward_trains_model: False stops the reward head's gradient before the model (pre-training)
         :param kl_scale: weight of the KL
-        :param discount_scale: weight of the discount head's loss
         :return: loss (scalar) and metrics (detached scalars)
         """
         kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
@@ -102,7 +100,7 @@ class WorldModel(nn.Module):
         if self.discount_logit is not None:
             goes_on = (~is_terminal).to(reward.dtype)
             discount_nll = distributions.bernoulli_nll(self.discount_logit(posterior.feature), goes_on).mean()
-            loss = loss + discount_scale * discount_nll
+            loss = loss + discount_nll
             metrics["discount_loss"] = discount_nll
         with th.no_grad():
             metrics["prior_entropy"] = distributions.categorical_entropy(posterior.prior_logits).mean()
