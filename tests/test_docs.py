@@ -94,7 +94,7 @@ def test_an_intrinsic_reward_of_ones_own(small_world):
 def test_cartpole(monkeypatch):
     monkeypatch.setitem(PRESETS, "vector", PRESETS["tiny"])
     [block] = code_blocks("docs/sb3.md")
-    model = run(block.replace("30_000", "200"), {})["model"]
+    model = run(block.replace("20_000", "200"), {})["model"]
     assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
 
 
