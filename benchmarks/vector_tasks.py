@@ -116,12 +116,13 @@ def main() -> None:
     parser.add_argument("task", choices=sorted(RANDOM))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--steps", type=int, help="agent steps (default: the task's own)")
+    parser.add_argument("--episodes", type=int, default=20, help="of the evaluation at the end (default: 20)")
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
     th.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     for seed in options.seeds:
-        run = learn(options.task, seed, options.steps)
+        run = learn(options.task, seed, options.steps, options.episodes)
         with open(options.out / f"{stem(options.task)}_{seed}.csv", "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["steps", "cpu_seconds", "return"])

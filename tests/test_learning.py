@@ -39,7 +39,8 @@ def test_it_is_learnt_in_minutes(vector_tasks, task):
 def test_the_script_writes_the_curves(vector_tasks, monkeypatch, tmp_path, capsys, task):
     monkeypatch.setitem(PRESETS, "vector", PRESETS["tiny"])
     steps = {"CartPole-v1": 150, "Pendulum-v1": 420}[task]
-    monkeypatch.setattr(sys, "argv", ["x", task, "--seeds", "3", "4", "--steps", str(steps), "--out", str(tmp_path)])
+    options = ["--seeds", "3", "4", "--steps", str(steps), "--episodes", "1", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["vector_tasks.py", task, *options])
     vector_tasks.main()
     printed = capsys.readouterr().out
     assert f"{task} seed 3: " in printed and f"{task} seed 4: " in printed
