@@ -167,12 +167,11 @@ class Learner:
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
             # Nothing is chosen where the episode is over, though a dream begins there.
-            actor_weight = weight * goes_on
+            chosen = weight * goes_on
             if log_prob is None:
-                loss = actor_critic.actor_loss(target, actor_weight)
+                loss = actor_critic.actor_loss(target, chosen)
             else:
-                entropy = imagination.entropy
-                loss = actor_critic.reinforce_loss(target, value, actor_weight, log_prob, entropy, config.ent_coef)
+                loss = actor_critic.reinforce_loss(target, value, chosen, log_prob, imagination.entropy, config.ent_coef)
         actor_grad_norm = self.actor_optimizer.step(loss)
         with self._products():
             value_now = agent.critic(imagination.feature[:-1].detach(), skill)

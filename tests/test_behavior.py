@@ -256,9 +256,13 @@ def test_intrinsic_module_learns_from_the_pass_before_the_model_step(learner, ba
     assert th.allclose(metrics["intrinsic_loss"], loss)
 
 
-@pytest.mark.parametrize("intrinsic", [None, "lbs"])
-def test_an_update_never_asks_the_device_for_a_value(learner, batch, monkeypatch, intrinsic):
-    its = learner(intrinsic, discount_head=True)
+@pytest.mark.parametrize("kind", [None, "lbs", "choices"])
+def test_an_update_never_asks_the_device_for_a_value(learner, world_model, batch, monkeypatch, kind):
+    if kind == "choices":
+        agent = Agent(world_model(discount_head=True), [8], None, classes=(2,))
+        its = Learner(agent, LearnerConfig(**LEARNER, actor_gradient="reinforce"))
+    else:
+        its = learner(kind, discount_head=True)
     its.update(batch)  # anything that torch sets up once
 
     def refuse(*_, **__):
