@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_dreamer_urlb import arguments, numerical_faults, phases
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
@@ -69,6 +70,10 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     :param ent_coef: weight of the actor's entropy; None: 0 while exploring, 1e-4 on a task
     :param free_nats: the KL that costs nothing
     :param kl_balance: share of the KL's gradient that trains the prior
+    :param kl_scale: weight of the KL in the model's loss
+    :param actor_gradient: ``"dynamics"``: through the model, straight through where actions are one-hot; ``"reinforce"``: by
+        the score function, for Discrete and MultiDiscrete actions; ``"auto"``: REINFORCE for these, dynamics for Box (as
+        DreamerV2)
     :param target_update_interval: updates between two copies of the critic to the slow critic
     :param adam_eps: ε of all optimisers
     :param max_grad_norm: bound of each optimiser's gradient norm
@@ -124,6 +129,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         ent_coef: float | None = None,
         free_nats: float = 1.0,
         kl_balance: float = 0.8,
+        kl_scale: float = 1.0,
+        actor_gradient: str = AUTO,
         target_update_interval: int = 100,
         adam_eps: float = 1e-5,
         max_grad_norm: float = 100.0,
@@ -178,6 +185,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.ent_coef = ent_coef
         self.free_nats = free_nats
         self.kl_balance = kl_balance
+        self.kl_scale = kl_scale
+        self.actor_gradient = actor_gradient
         self.target_update_interval = target_update_interval
         self.adam_eps = adam_eps
         self.max_grad_norm = max_grad_norm
@@ -273,6 +282,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             weight_decay=self.weight_decay,
             free_nats=self.free_nats,
             kl_balance=self.kl_balance,
+            kl_scale=self.kl_scale,
+            actor_gradient=choose_gradient(self.actor_gradient, make_actions(self.action_space).classes),
             imagination_horizon=self.imagination_horizon,
             gae_lambda=self.gae_lambda,
             target_update_interval=self.target_update_interval,

@@ -160,7 +160,7 @@ AFTERWARDS = {name.removeprefix("after_"): check for name, check in list(globals
 def test_cartpole(monkeypatch):
     monkeypatch.setitem(PRESETS, "vector", PRESETS["tiny"])
     [block] = code_blocks("docs/sb3.md")
-    model = run(block.replace("10_000", "200").replace("batch_length=8", "batch_length=4"), {})["model"]
+    model = run(block.replace("20_000", "200"), {})["model"]
     assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
 
 

@@ -1,7 +1,8 @@
 """Replay of whole episodes, drawn as sequences (spec/algorithms §3, spec/reliability "Replay").
 
 Row t of an episode holds observation t with the action and the reward that *led to* it. Each environment writes its own
-stream, so episodes may end at different times; only finished episodes are drawn, and a sequence never leaves its episode.
+stream, so episodes may end at different times; only finished episodes are drawn. A sequence never leaves its episode, unless
+``sampling="rows"`` says so.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.env_steps import is_fault
 from sb3_dreamer_urlb.replay import stores
+from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, check_sampling, draw
 from sb3_dreamer_urlb.types import SequenceBatch
 
 if TYPE_CHECKING:
@@ -161,6 +163,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         'sb3_dreamer_urlb[lmdb]'``); open episodes are in memory in any case
     :param path: folder of the file; each phase has its own in it. Rows that an earlier run left there are taken over
     :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
+    :param sampling: ``"episodes"`` draws an episode uniformly, then a start uniformly, and leaves out episodes shorter than
+        a sequence (the paper); ``"rows"`` draws the start from all rows uniformly, and goes on with the next episode's first
+        row where one ends before the sequence does. For tasks that terminate: short episodes are kept and weigh no more
+        than they are long, and last rows, which show how episodes end, come as often as any other
     :raises ValueError: for arguments that do not fit
     :raises ModuleNotFoundError: if lmdb is not installed
     """
@@ -181,6 +187,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         store: str = "memory",
         path: str | os.PathLike[str] | None = None,
         map_size: int | None = None,
+        sampling: str = BY_EPISODE,
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -193,6 +200,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.batch_length = batch_length
         # A piece must fit into the buffer, or it would be all that is ever held.
         self.max_episode_rows = min(max_episode_rows, buffer_size)
+        check_sampling(sampling)
+        self.sampling = sampling
         self.phase = phase
         self.skill_size = skill_size
         self.rng = np.random.default_rng(seed)
@@ -321,7 +330,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             return
         self.finished_count += 1
         self.longest = max(self.longest, len(episode))
-        if len(episode) < self.batch_length:
+        if self.sampling == BY_EPISODE and len(episode) < self.batch_length:
             return
         if self.disk is None:
             self.episodes.append(episode.finish())
@@ -356,17 +365,17 @@ class SequenceReplayBuffer(ReplayBuffer):
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def can_sample(self) -> bool:
-        """Whether any finished episode is long enough."""
+        """Whether any finished episode is long enough, or all of them together if sequences may run through several."""
         self.attach()
-        return len(self.episodes) > 0
+        return len(self.episodes) > 0 and self.finished_rows >= self.batch_length
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceBatch:  # type: ignore[override]
-        """Draw sequences: an episode uniformly, then a start uniformly (spec/algorithms §3).
+        """Draw sequences, as ``sampling`` says.
 
         :param batch_size: B
         :param env: normalises observations and rewards if given
         :return: (B, T, …) on ``device``
-        :raises ValueError: if no finished episode has ``batch_length`` rows
+        :raises ValueError: if finished episodes have not the rows for it
         """
         if not self.can_sample():
             raise ValueError(f"No finished episode has batch_length={self.batch_length} rows yet.")
@@ -375,13 +384,14 @@ class SequenceReplayBuffer(ReplayBuffer):
             name: np.empty((batch_size, length, *rows.shape[1:]), rows.dtype)
             for name, rows in self.episodes[0].rows(0, 1).items()
         }
-        for b, index in enumerate(self.rng.integers(len(self.episodes), size=batch_size)):
-            episode = self.episodes[index]
-            start = self.rng.integers(len(episode) - length + 1)
-            for name, rows in episode.rows(start, start + length).items():
-                columns[name][b] = rows
         is_first = np.zeros((batch_size, length), bool)
-        is_first[:, 0] = True
+        for b, pieces in enumerate(draw(self.sampling, self.rng, self.episodes, length, batch_size)):
+            t = 0
+            for index, start, stop in pieces:
+                is_first[b, t] = True
+                for name, rows in self.episodes[index].rows(start, stop).items():
+                    columns[name][b, t : t + stop - start] = rows
+                t += stop - start
         observation = self._normalize_obs(observation_of(columns), env)
         reward = self._normalize_reward(columns["reward"], env).astype(np.float32, copy=False)
         return SequenceBatch(
