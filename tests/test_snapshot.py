@@ -565,6 +565,19 @@ def test_a_file_of_version_1_is_brought_up_to_date(saved, tmp_path):
     assert set(MIGRATIONS) == set(range(1, VERSION))
 
 
+def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
+    """It counted neither faults of environments nor skipped updates."""
+    old = json.loads(members(saved[1])["data"])
+    for name in ("env_faults", "skipped_updates"):
+        old["counters"][name] = 5
+    assert load(with_version(saved[1], tmp_path / "new.zip", VERSION, old)).env_faults == 5
+    for name in ("env_faults", "skipped_updates"):
+        del old["counters"][name]
+    loaded = load(with_version(saved[1], tmp_path / "old.zip", 2, old))
+    assert same(loaded, saved[0]) and (loaded.env_faults, loaded.skipped_updates) == (0, 0)
+    refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "env_faults")
+
+
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])
 def test_versions_that_nobody_reads(saved, tmp_path, version):
     refused(with_version(saved[1], tmp_path / "m.zip", version), "version")
