@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.noise import ActionNoise
@@ -65,6 +66,7 @@ def check(model: DreamerV2) -> None:
 
     :raises ValueError: naming the argument, its value and what was expected
     """
+    _check_settings(model)
     for name, least in INTEGERS.items():
         check_integer(name, getattr(model, name), least)
     for name, (low, low_ok, high, high_ok) in NUMBERS.items():
@@ -95,6 +97,21 @@ def check(model: DreamerV2) -> None:
     _check_spaces(model)
     if model.env is not None:
         _check_episode_fits(model.env, model.batch_length)
+
+
+def _check_settings(model: DreamerV2) -> None:
+    """What is not the algorithm's, but Stable-Baselines3's: it takes anything, and fails later."""
+    check_integer("stats_window_size", model._stats_window_size, 1)
+    if model.seed is not None and not (is_integer(model.seed) and 0 <= model.seed < 2**32):
+        raise ValueError(f"seed must be an integer in [0, 2**32), or None, got {model.seed!r}.")
+    if not is_integer(model.verbose) or not 0 <= model.verbose <= 2:
+        raise ValueError(f"verbose must be 0, 1 or 2, got {model.verbose!r}.")
+    if model.tensorboard_log is not None and not isinstance(model.tensorboard_log, str | os.PathLike):
+        raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
+    for name in ("policy_kwargs", "replay_buffer_kwargs", "planner_kwargs"):
+        value = getattr(model, name)
+        if value is not None and not isinstance(value, dict):
+            raise ValueError(f"{name} must be a dictionary or None, got {value!r}.")
 
 
 def _check_names(model: DreamerV2) -> None:

@@ -220,11 +220,13 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
 
     def _prepare(self) -> None:
         """Everything of the set-up that builds nothing yet."""
+        arguments.check(self)
+        # Paths as snapshots can hold them.
         path = self.replay_buffer_kwargs.get("path")
         if isinstance(path, os.PathLike):
-            # As snapshots can hold it.
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
-        arguments.check(self)
+        if isinstance(self.tensorboard_log, os.PathLike):
+            self.tensorboard_log = os.fspath(self.tensorboard_log)
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)

@@ -24,7 +24,7 @@ from sb3_dreamer_urlb.evaluation import history as evaluations
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
-from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming
+from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming, reading
 from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
 
 if TYPE_CHECKING:
@@ -231,6 +231,16 @@ def _plain_name(name: Any) -> str:
     if not isinstance(name, str) or Path(name).name != name or not name.endswith(".zip"):
         raise ValueError(f"it names the replay file {str(name)[:80]!r}")
     return name
+
+
+def steps_done(folder: str | os.PathLike[str]) -> int:
+    """Agent steps (``num_timesteps``) at the last checkpoint.
+
+    :param folder: of a run that has one
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    with reading(Path(folder) / SNAPSHOT, model_snapshot.KIND) as archive:
+        return int(archive.data["counters"]["num_timesteps"])
 
 
 def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **kwargs: Any) -> Model | None:

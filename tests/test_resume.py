@@ -278,7 +278,9 @@ class Dies(CounterEnv):
 def test_a_run_that_an_environment_ends_leaves_a_checkpoint(tiny_model, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     model = tiny_model(FaultGuard(Dies(90), max_faults=2), "CnnPolicy")
-    with pytest.raises(EnvironmentFaultError, match=r"step 92.*the simulator is gone.*The last good state is in run\.") as caught:
+    with pytest.raises(
+        EnvironmentFaultError, match=r"step 92.*the simulator is gone.*The last good state is in run\."
+    ) as caught:
         model.learn(400, callback=RunCheckpointCallback("run", 10_000))
     assert isinstance(caught.value.__cause__, EnvironmentFaultError)
     resumed = DreamerV2.resume("run", CounterEnv(20), device="cpu")
