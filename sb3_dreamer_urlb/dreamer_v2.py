@@ -144,6 +144,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
+        arguments.check_verbose(verbose)
         super().__init__(
             policy,
             env,
