@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.noise import ActionNoise
@@ -13,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.precision import PRECISIONS
@@ -68,6 +69,7 @@ def check(model: DreamerV2) -> None:
 
     :raises ValueError: naming the argument, its value and what was expected
     """
+    _check_settings(model)
     for name, least in INTEGERS.items():
         check_integer(name, getattr(model, name), least)
     for name, (low, low_ok, high, high_ok) in NUMBERS.items():
@@ -98,6 +100,26 @@ def check(model: DreamerV2) -> None:
     _check_spaces(model)
     if model.env is not None:
         _check_episode_fits(model, model.env)
+
+
+def _check_settings(model: DreamerV2) -> None:
+    """What is not the algorithm's, but Stable-Baselines3's: it takes anything, and fails later."""
+    check_integer("stats_window_size", model._stats_window_size, 1)
+    if model.seed is not None and not (is_integer(model.seed) and 0 <= model.seed < 2**32):
+        raise ValueError(f"seed must be an integer in [0, 2**32), or None, got {model.seed!r}.")
+    if model.tensorboard_log is not None and not isinstance(model.tensorboard_log, str | os.PathLike):
+        raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
+    for name in ("policy_kwargs", "replay_buffer_kwargs", "planner_kwargs"):
+        check_dict(name, getattr(model, name))
+
+
+def check_verbose(verbose: Any) -> None:
+    """Before Stable-Baselines3 compares it with numbers.
+
+    :raises ValueError: for anything but 0, 1 and 2
+    """
+    if not is_integer(verbose) or not 0 <= verbose <= 2:
+        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
 
 
 def _check_names(model: DreamerV2) -> None:

@@ -16,11 +16,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, numerical_faults, phases
+from sb3_dreamer_urlb import arguments, numerical_faults, phases, run_checkpoints
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
+from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
+from sb3_dreamer_urlb.last_state import save_last_good_state
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
@@ -149,6 +151,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
+        arguments.check_verbose(verbose)
         super().__init__(
             policy,
             env,
@@ -205,6 +208,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.action_repeat = 1
         #: faults that environments' guards reported so far
         self.env_faults = 0
+        self._skipped_before = 0
         #: of the environment's task, None where it does not tell
         self.domain: str | None = None
         #: where the run is kept, None unless a RunCheckpointCallback does
@@ -226,14 +230,16 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
 
     def _prepare(self) -> None:
         """Everything of the set-up that builds nothing yet."""
+        arguments.check(self)
+        # Paths as snapshots can hold them.
+        path = self.replay_buffer_kwargs.get("path")
+        if isinstance(path, os.PathLike):
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
+        if isinstance(self.tensorboard_log, os.PathLike):
+            self.tensorboard_log = os.fspath(self.tensorboard_log)
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
-        path = self.replay_buffer_kwargs.get("path")
-        if isinstance(path, os.PathLike):
-            # As snapshots can hold it.
-            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
-        arguments.check(self)
         self._convert_train_freq()
         self._read_env()
 
@@ -243,7 +249,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.skill_size = 0 if intrinsic is None or intrinsic.skills is None else intrinsic.skills.dim
         if getattr(self, "replay_buffer", None) is None:
             self.replay_buffer = self._new_replay_buffer()
-        self.policy = self._new_policy().to(self.device)
+        self._skipped_before = self.skipped_updates
+        self.policy = self._new_policy(intrinsic).to(self.device)
         self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
         self.learner.updates = self.phase_updates
         if self.verbose >= 1:
@@ -251,14 +258,14 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
-    def _new_policy(self) -> DreamerPolicy:
+    def _new_policy(self, intrinsic: IntrinsicReward | None) -> DreamerPolicy:
         return self.policy_class(
             self.observation_space,
             self.action_space,
             self.lr_schedule,
             gamma=self.gamma,
             discount_head=bool(self.discount_head),
-            intrinsic=self._intrinsic(),
+            intrinsic=intrinsic,
             explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             precision=self.precision,
@@ -314,6 +321,17 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         if policy_name not in self.policy_aliases:
             raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}.")
         return self.policy_aliases[policy_name]
+
+    @property
+    def skipped_updates(self) -> int:
+        """Updates so far, in both phases, that were skipped because a loss or gradient was not finite."""
+        learner: Learner | None = getattr(self, "learner", None)
+        return self._skipped_before + (0 if learner is None else learner.guard.total())
+
+    @skipped_updates.setter
+    def skipped_updates(self, count: int) -> None:
+        # As of a file, before there is a learner.
+        self._skipped_before = count
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
@@ -377,37 +395,48 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     ) -> SelfDreamerV2:
         """Collect and learn for ``total_timesteps`` agent steps; as SB3's, but warm-ups count by phase, not by call.
 
-        :param total_timesteps: agent steps
+        :param total_timesteps: agent steps; where a ``RunCheckpointCallback(..., resume="auto")`` goes on with a run, of the
+            whole run
         :param callback: SB3 callback(s)
         :param log_interval: episodes between two log lines
         :param tb_log_name: name of the TensorBoard run
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
+        :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         """
         with self.during_learn:
+            if run_checkpoints.resume_if_asked(self, callback):
+                total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False
             total_timesteps, callbacks = self._setup_learn(
                 total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
             )
             callbacks.on_training_start(locals(), globals())
-            assert self.env is not None and isinstance(self.train_freq, TrainFreq)
-            while self.num_timesteps < total_timesteps:
-                rollout = self.collect_rollouts(
-                    self.env,
-                    callbacks,
-                    self.train_freq,
-                    self.replay_buffer,
-                    self.action_noise,
-                    self.learning_starts,
-                    log_interval,
-                )
-                if not rollout.continue_training:
-                    break
-                # SB3 gates on num_timesteps, which every learn() resets.
-                if self.phase_timesteps > self.learning_starts:
-                    steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
-                    self.train(steps, self.batch_size)
+            try:
+                self._collect_and_train(total_timesteps, callbacks, log_interval)
+            except EnvironmentFaultError as error:
+                raise EnvironmentFaultError(f"{error} {save_last_good_state(self)}") from error
             callbacks.on_training_end()
             return self
+
+    def _collect_and_train(self, total_timesteps: int, callbacks: BaseCallback, log_interval: int) -> None:
+        assert isinstance(self.train_freq, TrainFreq)
+        while self.num_timesteps < total_timesteps:
+            assert self.env is not None
+            rollout = self.collect_rollouts(
+                self.env,
+                callbacks,
+                self.train_freq,
+                self.replay_buffer,
+                self.action_noise,
+                self.learning_starts,
+                log_interval,
+            )
+            if not rollout.continue_training:
+                break
+            # SB3 gates on num_timesteps, which every learn() resets.
+            if self.phase_timesteps > self.learning_starts:
+                steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
+                self.train(steps, self.batch_size)
 
     def _setup_learn(
         self,
@@ -421,6 +450,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             # The environments are about to be reset.
             self.replay_buffer.close_streams()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.run_folder is not None:
+            self.run_folder.restore_normalization(self)
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._vec_normalize_env)
         return result
@@ -459,7 +490,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         """Write the log; the only place where metrics leave the device."""
         for name, value in self._metrics.take().items():
             self.logger.record(f"train/{name}", value)
-        self.logger.record("train/skipped_updates", self.learner.guard.total())
+        self.logger.record("train/skipped_updates", self.skipped_updates)
         self.logger.record("rollout/env_faults", self.env_faults)
         self.logger.record("time/phase", self.phase, exclude="tensorboard")
         self.logger.record("time/phase_frames", self.phase_frames)

@@ -33,6 +33,16 @@ def check_integer(name: str, value: Any, least: int) -> None:
         raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
 
 
+def check_dict(name: str, value: Any) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :raises ValueError: if ``value`` is neither a dictionary nor None
+    """
+    if value is not None and not isinstance(value, dict):
+        raise ValueError(f"{name} must be a dictionary or None, got {value!r}.")
+
+
 def check_positive(owner: Any, *names: str) -> None:
     """
     :param owner: whose attributes to check

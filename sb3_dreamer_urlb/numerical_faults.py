@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch as th
 
 from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.last_state import save_last_good_state
 from sb3_dreamer_urlb.optim import ClippedAdam
 
 if TYPE_CHECKING:
@@ -98,19 +98,3 @@ def stop_if_repeated(model: DreamerV2) -> None:
         f"At step {model.num_timesteps}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
         f"the {' and the '.join(parts)} was not finite. {save_last_good_state(model)} Smaller learning rates may help."
     )
-
-
-def save_last_good_state(model: DreamerV2) -> str:
-    """Write a checkpoint where a RunCheckpointCallback keeps the run, else a snapshot into the folder of the log.
-
-    :param model: whose weights are finite
-    :return: a sentence that says where it is, or why there is none
-    """
-    try:
-        if model.checkpoint is not None:
-            return f"The last good state is in {model.checkpoint()}."
-        path = Path(model.logger.get_dir() or ".").resolve() / f"last_good_state_{model.num_timesteps}.zip"
-        model.save(path)
-        return f"The last good state is in {path}."
-    except (OSError, ValueError) as error:
-        return f"The last good state could not be written: {error}"

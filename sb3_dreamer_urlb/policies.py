@@ -17,6 +17,7 @@ from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.observation_checks import checked_observation
 from sb3_dreamer_urlb.planning import DynaMPC
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
@@ -272,9 +273,7 @@ class DreamerPolicy(BasePolicy):
         :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
         """
         self.set_training_mode(False)
-        if isinstance(observation, tuple):
-            raise ValueError("predict() takes the observation, got a tuple: Gymnasium's `obs, info = env.reset()`?")
-        tensor, vectorized = self.obs_to_tensor(observation)
+        tensor, vectorized = self.obs_to_tensor(checked_observation(observation, self.observation_space))
         self.observations.check(tensor)
         n = batch_size(tensor)
         memory = self.initial_state(n) if state is None else self._memory(state, n)

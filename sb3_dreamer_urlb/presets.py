@@ -10,6 +10,8 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+from sb3_dreamer_urlb.number_checks import check_dict
+
 PRESETS: dict[str, dict[str, Any]] = {
     # Paper appendix "Hyperparameters" and spec/algorithms: the constructor's own defaults.
     "paper": {},
@@ -106,6 +108,7 @@ def with_preset(init: Callable[..., None]) -> Callable[..., None]:
         preset = get_preset(given.get("preset", signature.parameters["preset"].default))
         for name, value in preset.items():
             if name in MERGED:
+                check_dict(name, given.get(name))
                 kwargs[name] = {**value, **(given.get(name) or {})}
             elif name not in given:
                 kwargs[name] = value

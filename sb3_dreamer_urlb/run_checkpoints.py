@@ -1,4 +1,4 @@
-"""The callback that keeps a run in a folder, and lets it end cleanly on a signal."""
+"""The callback that keeps a run in a folder, goes on with it, and lets it end cleanly on a signal."""
 
 from __future__ import annotations
 
@@ -10,17 +10,24 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 
+from sb3_dreamer_urlb import run_folder
+from sb3_dreamer_urlb.evaluation import history
 from sb3_dreamer_urlb.run_folder import RunFolder
+from sb3_dreamer_urlb.snapshots.model_data import ATTRIBUTES, describe_arguments
+from sb3_dreamer_urlb.snapshots.values import contains_custom, decode
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 
 class RunCheckpointCallback(BaseCallback):
-    """Keep a run in a folder, so that ``DreamerV2.resume(folder, env)`` goes on with it after whatever killed it.
+    """Keep a run in a folder, so that it can go on after whatever killed it.
+
+    With ``resume="auto"`` the same script, started again, does so: when ``learn`` begins and the folder holds a checkpoint,
+    the new model becomes the one of the checkpoint, and ``total_timesteps`` counts the whole run. Without, that is up to
+    ``DreamerV2.resume(folder, env)``.
 
     Checkpoints are taken between rollouts. Holds the folder's lock while learning. On SIGTERM or SIGINT the step is
     finished, a checkpoint written, and the process exits (``SystemExit``, ``KeyboardInterrupt``); a second signal exits at
@@ -30,9 +37,10 @@ class RunCheckpointCallback(BaseCallback):
     :param every_frames: environment frames between two checkpoints
     :param evaluation: whose best result and schedule the run should remember
     :param handle_signals: False leaves SIGTERM and SIGINT alone
-    :param verbose: 1 prints each checkpoint
-    :raises ValueError: for a number of frames that is not positive, and, when ``learn`` begins, for a folder with a run that
-        the model was not resumed from
+    :param verbose: 1 prints each checkpoint, and where a run goes on
+    :param resume: ``"auto"``, or None to leave a run that is there alone
+    :raises ValueError: for arguments that do not fit, and, when ``learn`` begins, for a folder with a run that the model was
+        not resumed from, or, with ``resume="auto"``, one of other arguments
     :raises RuntimeError: when ``learn`` begins, if another run is in the folder
     """
 
@@ -43,10 +51,14 @@ class RunCheckpointCallback(BaseCallback):
         evaluation: EvalCallback | None = None,
         handle_signals: bool = True,
         verbose: int = 0,
+        resume: str | None = None,
     ):
         super().__init__(verbose)
         if every_frames < 1:
             raise ValueError(f"every_frames must be positive, got {every_frames}.")
+        if resume not in (None, "auto"):
+            raise ValueError(f"resume must be 'auto' or None, got {resume!r}.")
+        self.resume = resume
         self.folder = Path(folder)
         self.every_frames = every_frames
         self.evaluation = evaluation
@@ -62,17 +74,17 @@ class RunCheckpointCallback(BaseCallback):
         model.during_learn.enter_context(run.locked())
         if not run.is_current():
             raise ValueError(
-                f"{self.folder} holds another run. To go on with it: DreamerV2.resume({str(self.folder)!r}, env); "
-                "for a new run choose another folder."
+                f"{self.folder} holds another run. To go on with it: RunCheckpointCallback(..., resume='auto') with a new "
+                f"model, or DreamerV2.resume({str(self.folder)!r}, env); for a new run choose another folder."
             )
         model.run_folder = self.run = run
+        run.begun = True
         model.checkpoint = self._checkpoint
         model.during_learn.callback(setattr, model, "checkpoint", None)
         self._saved = None if run.identity is None else self._state()
         self.received = None
         if self.evaluation is not None and run.evaluation is not None:
-            self.evaluation.best_mean_reward = run.evaluation["best_mean_reward"]
-            self.evaluation.n_calls = run.evaluation["n_calls"]
+            history.restore(self.evaluation, run.evaluation)
             run.evaluation = None
         if self.handle_signals and threading.current_thread() is threading.main_thread():
             model.during_learn.enter_context(self._watching())
@@ -105,25 +117,85 @@ class RunCheckpointCallback(BaseCallback):
         return self.received is None
 
     def _on_training_end(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        # rl_zoo3 calls this once more when the folder is not ours any longer.
+        if model.checkpoint is None:
+            return
         if self._saved != self._state():
             self._save()
-        if self.received == signal.SIGINT:
+        received, self.received = self.received, None
+        if received == signal.SIGINT:
             raise KeyboardInterrupt
-        if self.received is not None:
-            raise SystemExit(128 + self.received)
+        if received is not None:
+            raise SystemExit(128 + received)
 
     def _checkpoint(self) -> Path:
         self._save()
         return self.folder
 
     def _save(self) -> None:
-        evaluation = None
-        if self.evaluation is not None and np.isfinite(self.evaluation.best_mean_reward):
-            evaluation = {
-                "best_mean_reward": float(self.evaluation.best_mean_reward),
-                "n_calls": int(self.evaluation.n_calls),
-            }
-        self.run.save(self.model, evaluation)  # type: ignore[arg-type]
+        self.run.save(self.model, history.state(self.evaluation))  # type: ignore[arg-type]
         self._saved = self._state()
         if self.verbose >= 1:
             print(f"Checkpoint {self.run.number} in {self.folder}: {self._saved[0]}, {self._saved[1]} frames")
+
+
+def resume_if_asked(model: DreamerV2, callback: Any) -> bool:
+    """Go on with a run where a :class:`RunCheckpointCallback` says ``resume="auto"``; before ``learn`` does anything.
+
+    :param model: about to learn; becomes the checkpoint's
+    :param callback: what ``learn`` was given
+    :return: whether a run goes on
+    :raises ValueError: if it is one of other arguments
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    callbacks = _flat(callback)
+    asked = [one for one in callbacks if isinstance(one, RunCheckpointCallback) and one.resume == "auto"]
+    if not asked or not _go_on(model, asked[0].folder):
+        return False
+    if asked[0].verbose >= 1:
+        print(f"Going on with the run in {asked[0].folder} after {model.num_timesteps} steps.")
+    for one in callbacks:
+        # What is due every so many steps stays so.
+        one.n_calls = one.n_calls or model.num_timesteps // model.n_envs
+    return True
+
+
+def _argument(model: DreamerV2, name: str) -> Any:
+    return getattr(model, ATTRIBUTES.get(name, name))
+
+
+def _flat(callback: Any) -> list[BaseCallback]:
+    if isinstance(callback, list | tuple):
+        return [one for inner in callback for one in _flat(inner)]
+    if isinstance(callback, CallbackList):
+        return _flat(callback.callbacks)
+    return [callback] if isinstance(callback, BaseCallback) else []
+
+
+def _go_on(model: DreamerV2, folder: Path) -> bool:
+    mine = model.run_folder
+    if mine is not None and mine.path.resolve() == folder.resolve():
+        # DreamerV2.resume has been here; and from the second learn() on, steps count as ever.
+        return mine.resumed and not mine.begun
+    if model.phase_timesteps > 0:
+        return False  # it has a life of its own
+    arguments = describe_arguments(model)
+    given = {name: _argument(model, name) for name, value in arguments.items() if contains_custom(decode(value)) is not None}
+    own = {"verbose": model.verbose, "tensorboard_log": model.tensorboard_log}
+    options = {"device": model.device, "print_system_info": False, "kwargs": own}
+    found = run_folder.resume(type(model), folder, model.get_env(), custom_objects=given, **options)
+    if found is None:
+        return False
+    for name, value in describe_arguments(found).items():
+        if value != arguments[name]:
+            raise ValueError(
+                f"The run in {folder} has {name}={_argument(found, name)!r}, the model {_argument(model, name)!r}: with "
+                "resume='auto' a run keeps its arguments. DreamerV2.resume(folder, env, ...) takes others."
+            )
+    # Everything is the run's, but for what belongs to this call of learn.
+    state: dict[str, Any] = dict(vars(found))
+    state |= {name: value for name, value in vars(model).items() if name in ("during_learn", "_logger", "_custom_logger")}
+    vars(model).clear()
+    vars(model).update(state)
+    return True

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import warnings
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,10 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import torch as th
 
+from sb3_dreamer_urlb.evaluation import history as evaluations
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
+from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
-from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming
+from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming, reading
 from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
 
 if TYPE_CHECKING:
@@ -59,6 +63,10 @@ class RunFolder:
         #: what the evaluation was like when a resumed run was left, until somebody takes it
         self.evaluation: dict[str, Any] | None = None
         self.resumed = False
+        #: whether this process has learnt in it
+        self.begun = False
+        #: of VecNormalize, read and not yet given to an environment that was reset; None if there is nothing to do
+        self.statistics: dict[str, th.Tensor] | None = None
         self._buffer: weakref.ref[SequenceReplayBuffer] | None = None
 
     @property
@@ -110,6 +118,8 @@ class RunFolder:
         self.number, self.segments, self._buffer = number, segments, weakref.ref(buffer)
         self.identity = _identity(self.snapshot)
         self._remove_unnamed(open_name)
+        if buffer.disk is not None:
+            buffer.disk.release(buffer.evicted)
 
     def _remove_unnamed(self, open_name: str | None) -> None:
         named = {open_name, *(segment.name for segment in self.segments)}
@@ -142,11 +152,12 @@ class RunFolder:
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
-    def restore(self, model: DreamerV2, run: Any) -> None:
-        """Fill the replay of a model that was loaded from this folder's checkpoint.
+    def restore(self, model: DreamerV2, run: Any, statistics: dict[str, th.Tensor]) -> None:
+        """Fill the replay of a model that was loaded from this folder's checkpoint, and its VecNormalize.
 
         :param model: with an empty replay
         :param run: what :meth:`save` put into the checkpoint
+        :param statistics: of VecNormalize, empty without
         :raises SnapshotError: naming the file and why it is refused
         """
         with blaming(str(self.snapshot)):
@@ -159,9 +170,11 @@ class RunFolder:
             self.segments = [Segment(_plain_name(name), int(end)) for name, end in run["segments"]]
             open_name = None if run["open"] is None else _plain_name(run["open"])
             numbers = {name: int(run[name]) for name in ("evicted", "finished_count", "longest")}
-            if run["evaluation"] is not None:
-                best, calls = run["evaluation"]["best_mean_reward"], run["evaluation"]["n_calls"]
-                self.evaluation = {"best_mean_reward": float(best), "n_calls": int(calls)}
+            self.evaluation = None if run["evaluation"] is None else evaluations.checked(run["evaluation"])
+            normalizer = model.get_vec_normalize_env()
+            if normalizer is not None and statistics:
+                normalization.restore(normalizer, statistics)
+            self.statistics = statistics
         buffer = model.replay_buffer
         folder = self.path / REPLAY
         if buffer.path is not None:
@@ -177,6 +190,29 @@ class RunFolder:
             raise SnapshotError(f"{folder} lacks episodes that {self.snapshot} names.")
         replay_snapshot.restore(buffer, episodes[numbers["evicted"] - first :], open_, numbers)
         self._restored(buffer)
+
+    def restore_normalization(self, model: DreamerV2) -> None:
+        """Give the statistics to the environment that the run goes on in, which has just been reset.
+
+        What the reset added to them is undone: the observation that it stands for was counted when the run was left.
+
+        :param model: about to learn
+        :raises ValueError: if its environment has no VecNormalize
+        """
+        if self.statistics is None:
+            return
+        normalizer = model.get_vec_normalize_env()
+        if normalizer is None and self.statistics:
+            raise ValueError(f"The run in {self.path} normalises with VecNormalize, its environment is wrapped in none now.")
+        if normalizer is not None and not self.statistics:
+            warnings.warn(f"{self.snapshot} holds no statistics of VecNormalize: they begin anew.")
+        if normalizer is not None and self.statistics:
+            with blaming(str(self.snapshot)):
+                normalization.restore(normalizer, self.statistics)
+            training, normalizer.training = normalizer.training, False
+            model.restart_episodes()
+            normalizer.training = training
+        self.statistics = None
 
     def _restored(self, buffer: SequenceReplayBuffer) -> None:
         self._buffer, self.identity = weakref.ref(buffer), _identity(self.snapshot)
@@ -197,6 +233,16 @@ def _plain_name(name: Any) -> str:
     return name
 
 
+def steps_done(folder: str | os.PathLike[str]) -> int:
+    """Agent steps (``num_timesteps``) at the last checkpoint.
+
+    :param folder: of a run that has one
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    with reading(Path(folder) / SNAPSHOT, model_snapshot.KIND) as archive:
+        return int(archive.data["counters"]["num_timesteps"])
+
+
 def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **kwargs: Any) -> Model | None:
     """Go on with a run.
 
@@ -215,8 +261,8 @@ def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **k
     if not run_folder.snapshot.exists():
         return None
     with run_folder.locked():
-        model, run = model_snapshot.load(algorithm, run_folder.snapshot, env, resume=True, **kwargs)
-        run_folder.restore(model, run)
+        model, run, statistics = model_snapshot.load(algorithm, run_folder.snapshot, env, resume=True, **kwargs)
+        run_folder.restore(model, run, statistics)
     model.run_folder = run_folder
     if model.env is not None and model.seed is not None:
         # The run's own seed would bring the first episodes' resets back.

@@ -75,7 +75,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         whole: Any = cls
         arguments.check_load_keywords(whole, kwargs)
         model: SelfSavingAlgorithm
-        model, _ = model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)
+        model = model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)[0]
         return model
 
     @classmethod

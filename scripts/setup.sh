@@ -71,7 +71,6 @@ fingerprint() {
 
 install_packages() {
     local pip=("$venv/bin/python" -m pip --disable-pip-version-check) options=()
-    [[ -t 1 ]] || options+=(-qq)
     [[ -z ${TORCH_INDEX:-} ]] || options+=(--extra-index-url "$TORCH_INDEX")
     say "installing the pinned packages (some 2 GB on the disk; a minute or two the first time)"
     if [[ -z ${TORCH_INDEX:-} && $(uname -s) == Linux ]] && ! command -v nvidia-smi >/dev/null &&
@@ -79,7 +78,13 @@ install_packages() {
         say "no NVIDIA GPU is seen; should pip now fetch several GB of CUDA packages, stop it and give the same command with" \
             "TORCH_INDEX=https://download.pytorch.org/whl/cpu"
     fi
-    "${pip[@]}" install "${options[@]}" -c constraints.txt -e '.[dev,plots,zoo]'
+    if [[ -t 1 ]]; then
+        "${pip[@]}" install "${options[@]}" -c constraints.txt -e '.[dev,plots,zoo]'
+    else
+        # A log wants a line for each thing that takes its time, and no bars.
+        "${pip[@]}" install "${options[@]}" --progress-bar off -c constraints.txt -e '.[dev,plots,zoo]' |
+            awk '/^ *(Downloading|Building|Installing collected)/ { sub(/^ */, ""); print "setup: " substr($0, 1, 100); fflush() }'
+    fi
 }
 
 setup_python() {
@@ -141,6 +146,18 @@ setup_gl() {
     echo "$wanted" >"$venv/.renders"
 }
 
+# one_at_a_time: waits for another make that is setting up the same checkout. Without flock, which macOS lacks, nobody waits.
+one_at_a_time() {
+    command -v flock >/dev/null || return 0
+    mkdir -p "$(dirname "$venv")"
+    exec 9>"${venv%/}.lock"
+    if ! flock -n 9; then
+        say "another make is setting up this checkout; waiting for it"
+        flock 9
+    fi
+}
+
+one_at_a_time
 case ${1:-python} in
     python) setup_python ;;
     gl)

@@ -11,12 +11,21 @@ import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
+from snapshot_files import change_data
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, SnapshotCallback, dreamer_v2, policies, register_intrinsic_reward
+from sb3_dreamer_urlb import (
+    DreamerV2,
+    PhaseSwitchCallback,
+    SnapshotCallback,
+    SnapshotError,
+    dreamer_v2,
+    policies,
+    register_intrinsic_reward,
+)
 from sb3_dreamer_urlb.arguments import INTEGERS, NUMBERS, SHORT_EPISODES
 from sb3_dreamer_urlb.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.evaluation.scores import normalized_score
@@ -189,6 +198,43 @@ def test_net_arch(refused, net_arch, message):
     refused(message, policy_kwargs={"net_arch": net_arch})
 
 
+@pytest.mark.parametrize("name", ["learning_rate", "actor_learning_rate", "critic_learning_rate"])
+def test_a_rate_that_is_a_text(refused, name):
+    """What YAML makes of a bare 1e-4."""
+    refused(f"{name} must be a non-negative number or a schedule, got '1e-4'", **{name: "1e-4"})
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        *(
+            ({"seed": value}, r"seed must be an integer in \[0, 2\*\*32\), or None, got")
+            for value in ("a", -1, 1.5, 2**32, True)
+        ),
+        *(
+            ({"stats_window_size": value}, "stats_window_size must be an integer of at least 1")
+            for value in (0, "a", 2.5, None)
+        ),
+        ({"tensorboard_log": 3}, "tensorboard_log must be the path of a folder or None, got 3"),
+        *(({"verbose": value}, f"verbose must be 0, 1 or 2, got {value!r}") for value in ("x", 3, None)),
+        *(
+            ({name: 3}, f"{name} must be a dictionary or None, got 3")
+            for name in ("policy_kwargs", "replay_buffer_kwargs", "planner_kwargs")
+        ),
+    ],
+)
+def test_settings(refused, kwargs, message):
+    refused(message, **kwargs)
+
+
+def test_a_path_of_the_log(tiny_model, tmp_path):
+    model = tiny_model(tensorboard_log=tmp_path / "tb").learn(20)
+    model.save(tmp_path / "model")
+    assert list((tmp_path / "tb").rglob("events*")) and DreamerV2.load(tmp_path / "model").tensorboard_log == str(
+        tmp_path / "tb"
+    )
+
+
 # -- names -----------------------------------------------------------------------------------------------------------------
 
 
@@ -304,6 +350,63 @@ def test_short_episodes_are_enough_where_sequences_run_through_several(tiny_mode
 def test_a_long_episode_among_short_ones_is_enough(tiny_model):
     model = tiny_model(CounterEnv([1] * 30 + [5]), batch_length=4).learn(200)
     assert model._n_updates > 0
+
+
+# -- predict ---------------------------------------------------------------------------------------------------------------
+
+VECTOR = spaces.Box(-1, 1, (3,), np.float32)
+OBSERVATIONS = [
+    ("CnnPolicy", None, [1, 2, 3], r"must have the shape \(3, 16, 16\), its channels first or last.*got \(3,\)"),
+    ("CnnPolicy", None, np.zeros((3, 16)), r"must have the shape \(3, 16, 16\).*got \(3, 16\)"),
+    ("CnnPolicy", None, None, r"must be numbers of the shape \(3, 16, 16\).*got NoneType 'None'"),
+    ("MlpPolicy", VECTOR, [[1], [2, 3]], r"must be numbers of the shape \(3,\).*got list '\[\[1\], \[2, 3\]\]'"),
+    ("MlpPolicy", VECTOR, "abc", r"must be numbers of the shape \(3,\).*got str 'abc'"),
+    ("MlpPolicy", VECTOR, [1, 2], r"Unexpected observation shape \(2,\)"),
+    ("MultiInputPolicy", spaces.Dict({"a": VECTOR}), [1, 2, 3], r"must be a dictionary of \['a'\], got list"),
+    ("MultiInputPolicy", spaces.Dict({"a": VECTOR}), {"b": [1]}, r"has the parts \['b'\]; known are \['a'\]"),
+    ("MultiInputPolicy", spaces.Dict({"a": VECTOR}), {"a": "x"}, r"The observation 'a' must be numbers of the shape \(3,\)"),
+]
+
+
+@pytest.mark.parametrize(("policy", "space", "observation", "message"), OBSERVATIONS)
+def test_observations_that_are_none(tiny_model, policy, space, observation, message):
+    model = tiny_model(CounterEnv(observation_space=space), policy)
+    with pytest.raises(ValueError, match=message):
+        model.predict(observation)
+
+
+def test_a_list_of_the_right_shape_is_an_observation(tiny_model):
+    model = tiny_model(CounterEnv(observation_space=VECTOR), "MlpPolicy")
+    action, _ = model.predict([0.1, 0.2, 0.3], deterministic=True)
+    assert np.array_equal(action, model.predict(np.array([0.1, 0.2, 0.3], np.float32), deterministic=True)[0])
+
+
+# -- load ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "message"),
+    [
+        ({"batch_size": 0}, ValueError, "^batch_size must be an integer of at least 1, got 0"),
+        ({"custom_objects": {"gamma": 3}}, ValueError, r"^gamma must lie in \(0, 1\], got 3"),
+        ({"custom_objects": 3}, TypeError, "^custom_objects must be a dictionary of arguments by name or None, got 3"),
+        ({"device": "nonsense"}, RuntimeError, "^Expected one of cpu"),
+        ({"env": 3}, ValueError, "^The environment is of type <class 'int'>"),
+        ({"seed": "a"}, ValueError, r"^seed must be an integer .*got 'a'"),
+        ({"planner": "cem"}, ValueError, "^Unknown planner 'cem'"),
+    ],
+)
+def test_load_blames_the_file_only_for_what_is_in_it(tiny_model, tmp_path, kwargs, error, message):
+    tiny_model().save(tmp_path / "model")
+    with pytest.raises(error, match=message) as caught:
+        DreamerV2.load(tmp_path / "model", **kwargs)
+    assert not isinstance(caught.value, SnapshotError)
+    # What is wrong with the file stays its fault, whatever is given beside it.
+    broken = change_data(tmp_path / "model.zip", tmp_path / "broken.zip", lambda data: data["arguments"].update(gae_lambda=7))
+    with pytest.raises(SnapshotError, match=r"broken\.zip is refused: gae_lambda must lie in"):
+        DreamerV2.load(broken, batch_size=3)
+    with pytest.raises(SnapshotError, match="spaces do not match"):
+        DreamerV2.load(tmp_path / "model", env=CounterEnv(size=20))
 
 
 # -- while it runs ---------------------------------------------------------------------------------------------------------

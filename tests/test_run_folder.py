@@ -41,7 +41,7 @@ def vec_env(n_envs=1, length=LENGTH, **kwargs):
 def everything(model) -> dict[str, object]:
     """All that a run is made of: weights, moments, counters, replay, random states."""
     buffer = model.replay_buffer
-    episodes = [b"".join(rows[: len(e)].tobytes() for rows in e.columns.values()) for e in buffer.episodes]
+    episodes = [b"".join(rows.tobytes() for rows in e.rows(0, len(e)).values()) for e in buffer.episodes]
     return {
         "weights": {name: value.numpy().tobytes() for name, value in model.policy.state_dict().items()},
         "moments": {
@@ -61,30 +61,48 @@ def everything(model) -> dict[str, object]:
     }
 
 
+def close(model):
+    """What the end of a process does to a replay on disk."""
+    if model.replay_buffer.disk is not None:
+        model.replay_buffer.disk.close()
+
+
 def scramble():
     """What another process would begin with."""
     th.manual_seed(99), np.random.seed(99), random.seed(99)  # noqa: NPY002
 
 
-CASES = [("lbs", 2, {}), (None, 1, {"planner": "dyna_mpc"}), ("lbs", 1, {"buffer_size": 70})]
+LMDB = {"replay_buffer_kwargs": {"store": "lmdb", "path": "replay"}}
+CASES = [
+    ("lbs", 2, {}, 0),
+    (None, 1, {"planner": "dyna_mpc"}, 0),
+    ("lbs", 1, {"buffer_size": 70}, 0),
+    ("lbs", 1, {"buffer_size": 70, **LMDB}, 80),
+]
 
 
 # -- bit for bit -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("method", "n_envs", "kwargs"), CASES)
-def test_400_steps_are_200_and_a_resume_and_200(tiny_model, tmp_path, method, n_envs, kwargs):
-    def start():
+@pytest.mark.parametrize(("method", "n_envs", "kwargs", "beyond"), CASES)
+def test_400_steps_are_200_and_a_resume_and_200(tiny_model, tmp_path, monkeypatch, method, n_envs, kwargs, beyond):
+    """``beyond``: steps after the checkpoint, of which nothing may be left, in a full replay neither."""
+
+    def start(folder):
+        (tmp_path / folder).mkdir()
+        monkeypatch.chdir(tmp_path / folder)
         scramble()
         return tiny_model(vec_env(n_envs), intrinsic_reward=method, **kwargs)
 
-    whole = start().learn(400)
+    whole = start("whole").learn(400)
     expected = everything(whole)
-    start().learn(200, callback=RunCheckpointCallback(tmp_path / "run", 60))
+    model = start("cut").learn(200, callback=RunCheckpointCallback("run", 60))
+    model.learn(beyond, reset_num_timesteps=False)
+    close(model)
     scramble()
-    model = DreamerV2.resume(tmp_path / "run", vec_env(n_envs), device="cpu")
+    model = DreamerV2.resume("run", vec_env(n_envs), device="cpu")
     assert model.num_timesteps == 200 and model._n_updates > 0
-    model.learn(200, reset_num_timesteps=False, callback=RunCheckpointCallback(tmp_path / "run", 60))
+    model.learn(200, reset_num_timesteps=False, callback=RunCheckpointCallback("run", 60))
     found = everything(model)
     assert {name for name in expected if found[name] != expected[name]} == set()
 

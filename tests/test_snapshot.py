@@ -402,10 +402,10 @@ DATA = {
     "method as argument": (_argument("predict", "x"), "an argument 'predict'"),
     "private": (_argument("__class__", "x"), "an argument '__class__'"),
     "unknown tag": (_argument("learning_rate", {"!": "function", "code": "x"}), "unknown kind 'function'"),
-    "serialized": (_argument("learning_rate", {":type:": "x", ":serialized:": "gASV"}), "learning rate"),
+    "serialized": (_argument("learning_rate", {":type:": "x", ":serialized:": "gASV"}), "learning_rate"),
     "tag of list": (_argument("learning_rate", {"!": ["x"]}), "unknown kind"),
     "schedule": (_argument("learning_rate", {"!": "LinearSchedule", "start": "x", "end": 0, "end_fraction": 1}), "float"),
-    "text as rate": (_argument("learning_rate", "os.system"), "learning rate"),
+    "text as rate": (_argument("learning_rate", "os.system"), "learning_rate"),
     "intrinsic": (_argument("intrinsic_reward", {"!": "intrinsic", "name": "os"}), "Unknown intrinsic_reward"),
     "huge network": (_sizes(deter_size=10**12), ""),
     "large network": (_sizes(hidden_size=50_000, deter_size=50_000), "model's"),
@@ -563,6 +563,19 @@ def test_a_file_of_version_1_is_brought_up_to_date(saved, tmp_path):
     assert same(load(path), saved[0])
     refused(with_version(saved[1], tmp_path / "wrong.zip", 2, old), "other fields")
     assert set(MIGRATIONS) == set(range(1, VERSION))
+
+
+def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
+    """It counted neither faults of environments nor skipped updates."""
+    old = json.loads(members(saved[1])["data"])
+    for name in ("env_faults", "skipped_updates"):
+        old["counters"][name] = 5
+    assert load(with_version(saved[1], tmp_path / "new.zip", VERSION, old)).env_faults == 5
+    for name in ("env_faults", "skipped_updates"):
+        del old["counters"][name]
+    loaded = load(with_version(saved[1], tmp_path / "old.zip", 2, old))
+    assert same(loaded, saved[0]) and (loaded.env_faults, loaded.skipped_updates) == (0, 0)
+    refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "env_faults")
 
 
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])

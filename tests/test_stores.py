@@ -293,6 +293,43 @@ def test_a_run_on_disk_resumes_with_the_rows_of_its_checkpoint(tiny_model, tmp_p
     assert len(resumed.replay_buffer.episodes) > len(expected)
 
 
+def test_what_left_after_a_checkpoint_stays_until_the_next(tmp_path):
+    """Three checkpoints' worth of rows pass through a file; each time the last checkpoint can be gone back to."""
+    buffer = on_disk(tmp_path, n_envs=1)
+    for _ in range(3):
+        filled(buffer, 1600)
+        buffer.close_streams()
+        buffer.disk.release(buffer.evicted)
+        assert buffer.disk.held == []
+        expected, numbers = contents(buffer), counters(buffer)
+        end = buffer.evicted + len(buffer.episodes)
+        filled(buffer, 700)
+        assert buffer.evicted > numbers[0] and len(buffer.disk.held) == buffer.evicted - numbers[0]
+        buffer.disk.close()
+        buffer = on_disk(tmp_path, n_envs=1)
+        buffer.attach(taking_over=True)
+        buffer.roll_back(end, {"evicted": numbers[0], "finished_count": numbers[2], "longest": numbers[3]})
+        assert contents(buffer) == expected and counters(buffer) == numbers
+
+
+@pytest.mark.parametrize("length", [3, 12, 19])
+def test_without_room_for_what_left_a_run_goes_on(tmp_path, length):
+    """``map_size`` bounds everything; what the checkpoint lost by it is said when the run is resumed."""
+    buffer = SequenceReplayBuffer(
+        40, BIG, ACTION, "cpu", 1, batch_length=2, seed=0, store="lmdb", path=tmp_path, map_size=1 << 20
+    )
+    fill_big(buffer, 50, length)
+    buffer.disk.release(buffer.evicted)
+    first, end = buffer.evicted, buffer.evicted + len(buffer.episodes)
+    fill_big(buffer, 600, length)
+    assert (tmp_path / "replay" / "data.mdb").stat().st_size <= 1 << 20 and buffer.can_sample()
+    with pytest.warns(UserWarning, match=rf"{end - first} episodes that the checkpoint drew from .*not bit for bit"):
+        buffer.roll_back(end, {"evicted": first, "finished_count": 5, "longest": 5})
+    assert not buffer.can_sample()
+    fill_big(buffer, 100, length)
+    assert buffer.can_sample() and buffer.evicted >= end
+
+
 def test_a_fine_tuning_does_not_see_the_pre_trainings_rows(tiny_model, tmp_path):
     model = tiny_model(CounterEnv(20), intrinsic_reward="lbs", replay_buffer_kwargs={"store": "lmdb", "path": str(tmp_path)})
     model.learn(100, callback=PhaseSwitchCallback(60, CounterEnv(20)))

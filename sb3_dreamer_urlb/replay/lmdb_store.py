@@ -2,7 +2,8 @@
 
 An episode is stored in chunks of ``CHUNK`` rows, each the raw bytes of one column after the other. Its chunks, the
 removal of what it drives out and the new cursor are one transaction: after a kill at any moment the file holds whole
-episodes and a cursor that tells which.
+episodes and a cursor that tells which. Episodes that left since the last checkpoint stay in the file until the next one
+(:meth:`LmdbStore.release`), so that a resumed run begins with the rows that the checkpoint knew.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import shutil
 import weakref
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,6 +29,8 @@ FREE_PAGES = 16
 #: what a file needs beyond the rows: pages, freed ones that readers still see
 SPARE = 64 << 20
 RESERVE = 1 << 20
+#: rows for which the file has room beyond ``buffer_size``: those that leave between two checkpoints
+HELD_ROWS = 20_000
 
 
 class ReplayStoreError(RuntimeError):
@@ -72,6 +76,8 @@ class LmdbStore:
         self, path: Path, layout: dict[str, tuple[np.dtype, tuple[int, ...]]], identity: dict[str, Any], map_size: int
     ):
         self.path, self.layout, self.map_size = path, layout, map_size
+        #: number of the first episode that the last checkpoint needs; None keeps none that left
+        self.keep_from: int | None = None
         #: LMDB needs room even to remove something
         self.reserve = min(map_size // 8, RESERVE)
         self.row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
@@ -108,6 +114,8 @@ class LmdbStore:
             # Reading on would end in SIGBUS.
             raise ReplayStoreError(f"{self.path} is damaged: data.mdb is shorter than its {needed} bytes.")
         self.first, self.lengths, self.counters = 0, [], {"finished_count": 0, "longest": 0}
+        #: lengths of the episodes that left, and are still in the file for the last checkpoint's sake, oldest first
+        self.held: list[int] = []
         with self.env.begin() as transaction:
             stored = transaction.get(META)
         if stored is None:
@@ -116,8 +124,9 @@ class LmdbStore:
             meta = json.loads(bytes(stored))
             identity, first, lengths, counters = meta["identity"], meta["first"], meta["lengths"], meta["counters"]
             self.first, self.lengths = int(first), [int(length) for length in lengths]
+            self.held = [int(length) for length in meta.get("held", [])]
             self.counters = {name: int(counters[name]) for name in self.counters}
-            damaged = self.first < 0 or any(length < 1 for length in self.lengths)
+            damaged = self._oldest < 0 or any(length < 1 for length in self.held + self.lengths)
         except (ValueError, KeyError, TypeError):
             damaged = True
         if damaged:
@@ -134,6 +143,11 @@ class LmdbStore:
         self._closer()
 
     # -- the queue -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _oldest(self) -> int:
+        """Number of the oldest episode in the file."""
+        return self.first - len(self.held)
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -167,55 +181,99 @@ class LmdbStore:
                 self._write(episode, leaving, counters)
                 return more
             except lmdb.MapFullError:
-                leaving, gone = max(leaving, -(-len(self) // 8)), leaving
-                if not len(self):
+                # The bound counts for more than the last checkpoint's rows.
+                self.keep_from = None
+                leaving, gone = leaving if self.held else max(leaving, -(-len(self) // 8)), leaving
+                if not len(self) and not self.held:
                     raise ReplayStoreError(
                         f"{self.path}: map_size={self.map_size} bytes are too few for one episode."
                     ) from None
-                # First make room: LMDB reuses pages from the second transaction after the one that freed them.
-                self.env.set_mapsize(self.map_size)
-                self._write(None, leaving, self.counters)
-                self._write(None, 0, self.counters)
-                self.env.set_mapsize(self.map_size - self.reserve)
+                with self._removing():
+                    self._write(None, leaving, self.counters)
                 more, leaving = more + leaving - gone, 0
             except lmdb.Error as error:
                 # LMDB calls a full disk an input/output error.
                 free = shutil.disk_usage(self.path).free
                 raise OSError(f"{error}, {free} bytes are free (the replay stays as it was): {self.path}") from None
 
+    @contextmanager
+    def _removing(self) -> Iterator[None]:
+        """Around a transaction that removes: with the room for it, and such that what it frees can be used at once."""
+        self.env.set_mapsize(self.map_size)
+        try:
+            yield
+            # LMDB reuses pages from the second transaction after the one that freed them.
+            self._write(None, 0, self.counters)
+        finally:
+            self.env.set_mapsize(self.map_size - self.reserve)
+
     def _write(self, episode: Any, leaving: int, counters: dict[str, int]) -> None:
         first = self.first + leaving
-        lengths = [*self.lengths[leaving:], *([] if episode is None else [len(episode)])]
-        meta = {"identity": self._identity, "first": first, "lengths": lengths, "counters": counters}
+        kept_from = first if self.keep_from is None else min(self.keep_from, first)
+        end = self.first + len(self.lengths)
         with self.env.begin(write=True) as transaction:
-            for number in range(self.first, first):
-                self._delete(transaction, number, self.lengths[number - self.first])
-            if episode is not None:
-                number = self.first + len(self.lengths)
-                for start in range(0, len(episode), CHUNK):
-                    rows = episode.rows(start, min(start + CHUNK, len(episode)))
-                    value = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in self.layout)
-                    transaction.put(_key(number, start), value)
-            transaction.put(META, json.dumps(meta).encode())
-        self.first, self.lengths, self.counters = first, lengths, dict(counters)
+            added = [] if episode is None else [len(episode)]
+            state = self._cut(transaction, kept_from, first, end, added, counters)
+            for start in range(0, sum(added), CHUNK):
+                rows = episode.rows(start, min(start + CHUNK, len(episode)))
+                value = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in self.layout)
+                transaction.put(_key(end, start), value)
+        self.first, self.held, self.lengths, self.counters = state
 
-    def roll_back(self, end: int, counters: dict[str, int]) -> None:
-        """Forget the episodes from number ``end`` on: those after a checkpoint.
+    def _cut(
+        self, transaction: Any, kept_from: int, first: int, end: int, added: list[int], counters: dict[str, int]
+    ) -> tuple[int, list[int], list[int], dict[str, int]]:
+        """Remove the episodes before ``kept_from`` and from ``end`` on, and write the cursor.
 
-        :param end: number of the first that goes
+        :param transaction: to do it in
+        :param kept_from: number of the oldest that stays in the file
+        :param first: number of the oldest that is drawn
+        :param end: number after the last that stays
+        :param added: lengths of what the transaction adds after it
+        :param counters: to keep beside
+        :return: the new ``first``, ``held``, ``lengths`` and ``counters``
+        """
+        held: list[int] = []
+        lengths: list[int] = []
+        for number, length in enumerate(self.held + self.lengths, self._oldest):
+            if not kept_from <= number < end:
+                self._delete(transaction, number, length)
+            else:
+                (held if number < first else lengths).append(length)
+        lengths += added
+        meta = {"identity": self._identity, "first": first, "held": held, "lengths": lengths, "counters": counters}
+        transaction.put(META, json.dumps(meta).encode())
+        return first, held, lengths, dict(counters)
+
+    def release(self, first: int) -> None:
+        """A checkpoint is complete: what left before it may go.
+
+        :param first: number of the oldest episode that the checkpoint draws from
+        """
+        self.keep_from = first
+        if self._oldest < first:
+            # On a full disk they go with the next change.
+            with suppress(lmdb.Error), self._removing():
+                self._write(None, 0, self.counters)
+
+    def roll_back(self, end: int, first: int, counters: dict[str, int]) -> int:
+        """Go back to a checkpoint: forget the episodes after it, take back those that left since.
+
+        :param end: number of the first episode that goes
+        :param first: number of the oldest one that the checkpoint drew from
         :param counters: as of the checkpoint
+        :return: how many of the checkpoint's episodes are gone for good, because ``map_size`` had no room for them
         :raises ReplayStoreError: if episodes that the checkpoint names are not there
         """
-        kept = end - self.first
-        if kept > len(self.lengths) or end < 0:
+        if end > self.first + len(self.lengths) or end < 0:
             raise ReplayStoreError(f"{self.path} lacks episodes that the checkpoint names.")
-        kept = max(kept, 0)
-        meta = {"identity": self._identity, "first": end - kept, "lengths": self.lengths[:kept], "counters": counters}
-        with self.env.begin(write=True) as transaction:
-            for index in range(kept, len(self.lengths)):
-                self._delete(transaction, self.first + index, self.lengths[index])
-            transaction.put(META, json.dumps(meta).encode())
-        self.first, self.lengths, self.counters = end - kept, self.lengths[:kept], dict(counters)
+        there = min(max(first, self._oldest), end)
+        self.keep_from = there
+        with self._removing():
+            with self.env.begin(write=True) as transaction:
+                state = self._cut(transaction, there, there, end, [], counters)
+            self.first, self.held, self.lengths, self.counters = state
+        return there - first
 
     @staticmethod
     def _delete(transaction: Any, number: int, length: int) -> None:

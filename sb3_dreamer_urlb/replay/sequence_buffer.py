@@ -221,7 +221,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         self._reset_memory()
         if self.path is not None:
             self.attach(taking_over=True)
-            self.roll_back(0, {"finished_count": 0, "longest": 0})
+            self.roll_back(0, {"evicted": 0, "finished_count": 0, "longest": 0})
 
     def _reset_memory(self) -> None:
         #: finished episodes, oldest first
@@ -241,10 +241,11 @@ class SequenceReplayBuffer(ReplayBuffer):
         """
         if self.path is None or self.disk is not None:
             return
-        from sb3_dreamer_urlb.replay.lmdb_store import SPARE, LmdbStore
+        from sb3_dreamer_urlb.replay.lmdb_store import HELD_ROWS, SPARE, LmdbStore
 
+        rows = self.buffer_size + self.max_episode_rows + min(self.buffer_size, HELD_ROWS)
         # 1.3: pages that are not full.
-        map_size = self.map_size or int(1.3 * (self.buffer_size + self.max_episode_rows) * self.row_bytes()) + SPARE
+        map_size = self.map_size or int(1.3 * rows * self.row_bytes()) + SPARE
         layout = {name: (th.empty(0, dtype=dtype).numpy().dtype, shape) for name, (dtype, shape) in self.columns().items()}
         self.episodes = self.disk = LmdbStore(self.path, layout, {"phase": self.phase}, map_size)
         self._follow_disk()
@@ -257,13 +258,19 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.finished_count, self.longest = self.disk.counters["finished_count"], self.disk.counters["longest"]
 
     def roll_back(self, end: int, counters: dict[str, int]) -> None:
-        """Forget what came to the store on disk after a checkpoint.
+        """Bring the store on disk back to a checkpoint; warns if episodes of it are gone.
 
         :param end: number of the first episode that goes
-        :param counters: ``finished_count`` and ``longest`` as of the checkpoint
+        :param counters: ``evicted``, ``finished_count`` and ``longest`` as of the checkpoint
         """
         assert self.disk is not None
-        self.disk.roll_back(end, {name: counters[name] for name in ("finished_count", "longest")})
+        numbers = {name: counters[name] for name in ("finished_count", "longest")}
+        lost = self.disk.roll_back(end, counters["evicted"], numbers)
+        if lost:
+            warnings.warn(
+                f"{self.path}: {lost} episodes that the checkpoint drew from were driven out after it, for map_size="
+                f"{self.disk.map_size} bytes had no room for them. The run goes on, but not bit for bit."
+            )
         self._follow_disk()
 
     def size(self) -> int:

@@ -49,6 +49,17 @@ class SnapshotError(ValueError):
     """A file that is no snapshot of ours, is damaged, or does not fit; names the file and the reason."""
 
 
+class CallersError(Exception):
+    """Not the file is wrong, but what the caller gave beside it; carries the error that says what.
+
+    :param error: to raise instead
+    """
+
+    def __init__(self, error: Exception):
+        super().__init__(str(error))
+        self.error = error
+
+
 class Writer:
     """Puts one archive together.
 
@@ -232,6 +243,8 @@ def blaming(name: str) -> Iterator[None]:
         yield
     except SnapshotError:
         raise
+    except CallersError as wrong:
+        raise wrong.error from wrong.error.__cause__
     # zipfile alone raises most of these for damaged files; constructors raise the rest for fields of wrong types.
     except (
         zipfile.BadZipFile, zlib.error, struct.error, ValueError, TypeError, AssertionError, LookupError, EOFError,

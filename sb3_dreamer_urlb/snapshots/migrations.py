@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 #: of the files written now; goes up with every change that older code could not read
-VERSION = 2
+VERSION = 3
 
 
 def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
@@ -16,7 +16,14 @@ def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1}
+def _from_2(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Version 3 counts the environments' faults and the skipped updates, and run folders hold VecNormalize's statistics."""
+    if kind == "model" and isinstance(data.get("counters"), dict):
+        return {**data, "counters": {**data["counters"], "env_faults": 0, "skipped_updates": 0}}
+    return data
+
+
+MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2}
 
 
 def migrate(kind: str, data: dict[str, Any], version: int) -> dict[str, Any]:

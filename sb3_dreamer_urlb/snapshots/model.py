@@ -5,22 +5,18 @@ Not in the file: the replay (``save_replay_buffer``, or a run folder), the envir
 
 from __future__ import annotations
 
-import inspect
-from collections import deque
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.utils import check_for_correct_spaces, get_device, get_system_info
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
-from sb3_dreamer_urlb.snapshots import tensors, values
-from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, Target, reading, writing
-from sb3_dreamer_urlb.snapshots.random_state import RandomStates, capture
+from sb3_dreamer_urlb.snapshots import normalization, tensors
+from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
+from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
+from sb3_dreamer_urlb.snapshots.random_state import RandomStates
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -28,41 +24,7 @@ if TYPE_CHECKING:
 Model = TypeVar("Model", bound="DreamerV2")
 
 KIND = "model"
-#: constructor arguments that are the loader's business
-NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
-#: arguments whose attribute SB3 calls otherwise
-ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
-COUNTERS = (
-    "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates",
-    "phase_timesteps", "phase_updates", "phase_frames", "action_repeat",
-)  # fmt: skip
-FIELDS = {
-    "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "counters",
-    "progress_remaining", "random", "episodes", "run",
-}  # fmt: skip
-MAX_ENVS = 65_536
-#: whose statistics are kept
-MAX_EPISODES = 1000
 MOMENTS = ("exp_avg", "exp_avg_sq")
-
-
-def _is_dict_or_none(value: Any) -> bool:
-    return value is None or isinstance(value, dict)
-
-
-#: arguments that nobody else checks
-CHECKS: dict[str, Callable[[Any], bool]] = {
-    "verbose": lambda value: is_integer(value) and 0 <= value <= 2,
-    "stats_window_size": lambda value: is_integer(value) and 1 <= value <= 1_000_000,
-    "seed": lambda value: value is None or (is_integer(value) and 0 <= value < 2**32),
-    "tensorboard_log": lambda value: value is None or isinstance(value, str),
-    "preset": lambda value: isinstance(value, str),
-    "discount_head": lambda value: value is None or isinstance(value, bool),
-    "policy_kwargs": _is_dict_or_none,
-    "intrinsic_kwargs": _is_dict_or_none,
-    "planner_kwargs": _is_dict_or_none,
-    "replay_buffer_kwargs": _is_dict_or_none,
-}
 
 
 # -- saving ----------------------------------------------------------------------------------------------------------------
@@ -77,39 +39,12 @@ def save(model: DreamerV2, target: Target, run: dict[str, Any] | None = None) ->
     :raises ValueError: if a weight is not finite; the old file stays
     :raises OSError: naming the path; the old file stays
     """
-    content = tensors.pack(_all_tensors(model))
+    # Who saves a model alone saves its VecNormalize apart, as with every algorithm of SB3.
+    statistics = {} if run is None else normalization.pack(model.get_vec_normalize_env())
+    content = tensors.pack({**_all_tensors(model), **statistics})
     with writing(target, KIND) as writer:
         writer.add(TENSORS, content)
-        writer.finish(_data(model, run))
-
-
-def _data(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
-    arguments = {name: getattr(model, ATTRIBUTES.get(name, name)) for name in argument_names(type(model))}
-    arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
-    aliases = [alias for alias, known in model.policy_aliases.items() if known is model.policy_class]
-    return {
-        "policy": aliases[0] if aliases else values.encode_or_describe(model.policy_class),
-        "arguments": {name: values.encode_or_describe(value) for name, value in arguments.items()},
-        "observation_space": values.encode(model.observation_space),
-        "action_space": values.encode(model.action_space),
-        "n_envs": model.n_envs,
-        "phase": model.phase,
-        "domain": values.encode(model.domain),
-        "counters": {name.lstrip("_"): values.encode(getattr(model, name)) for name in COUNTERS},
-        "progress_remaining": float(model._current_progress_remaining),
-        "random": capture(model),
-        "episodes": [
-            {key: float(info[key]) for key in ("r", "l", "t")}
-            for info in list(model.ep_info_buffer or ())[-MAX_EPISODES:]
-            if all(is_finite_number(info.get(key)) for key in ("r", "l", "t"))
-        ],
-        "run": run,
-    }
-
-
-def argument_names(algorithm: type[DreamerV2]) -> list[str]:
-    """The constructor arguments that files hold."""
-    return [name for name in inspect.signature(algorithm.__init__).parameters if name not in NOT_STORED]
+        writer.finish(describe(model, run))
 
 
 def _all_tensors(model: DreamerV2) -> dict[str, th.Tensor]:
@@ -137,7 +72,7 @@ def load(
     print_system_info: bool,
     kwargs: dict[str, Any],
     resume: bool = False,
-) -> tuple[Model, dict[str, Any] | None]:
+) -> tuple[Model, dict[str, Any] | None, dict[str, th.Tensor]]:
     """Read a model.
 
     :param algorithm: class of the model
@@ -148,9 +83,14 @@ def load(
     :param print_system_info: print those of the file and of this machine
     :param kwargs: replaces arguments, too
     :param resume: restore the random states of an unseeded model, too
-    :return: the model, and what a run folder added
+    :return: the model, what a run folder added, and the statistics of its VecNormalize
     :raises SnapshotError: naming the file and why it is refused
+    :raises ValueError: or whatever else the constructor raises, if it is not the file but what was given that is wrong
     """
+    if not isinstance(custom_objects, dict | None):
+        raise TypeError(f"custom_objects must be a dictionary of arguments by name or None, got {custom_objects!r}.")
+    device = get_device(device)
+    wrapped = None if env is None else algorithm._wrap_env(maybe_make_env(env, 0), kwargs.get("verbose", 0))
     with reading(source, KIND) as archive:
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")
@@ -160,90 +100,66 @@ def load(
         data = archive.data
         if set(data) != FIELDS:
             raise ValueError(f"it has other fields than it should: {sorted(set(data) ^ FIELDS)}")
-        model = _blank(algorithm, data, device, custom_objects or {}, kwargs)
-        _restore_fields(model, data)
+        model = _prepared(algorithm, data, wrapped, device, custom_objects or {}, kwargs)
         states = None if data["random"] is None else RandomStates(data["random"])
-        if env is not None:
-            _attach(model, env)
-        model._prepare()
         _build_checked(model, archive)
-        _put(model, tensors.unpack(archive, TENSORS))
+        loaded = tensors.unpack(archive, TENSORS)
+        statistics = {name: loaded.pop(name) for name in list(loaded) if name.startswith(normalization.PREFIX)}
+        _put(model, loaded)
         # Runs that start from one unseeded model are meant to differ.
         if states is not None and (resume or model.seed is not None) and "seed" not in kwargs:
             states.apply(model)
-        return model, data["run"]
+        return model, data["run"], statistics
 
 
-def _blank(
-    algorithm: type[Model], data: dict[str, Any], device: th.device | str, custom: dict[str, Any], kwargs: dict[str, Any]
+def _prepared(
+    algorithm: type[Model],
+    data: dict[str, Any],
+    env: VecEnv | None,
+    device: th.device,
+    custom: dict[str, Any],
+    kwargs: dict[str, Any],
 ) -> Model:
-    """A model with the stored arguments and without networks."""
-    known = argument_names(algorithm)
-    arguments = dict(data["arguments"])
-    unknown = sorted(set(arguments) - set(known))
-    if unknown:
-        raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
-    given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
-    decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
-    for name, value in decoded.items():
-        if (missing := values.contains_custom(value)) is not None:
-            raise ValueError(
-                f"its {name} was {missing.description}, which no file can hold; "
-                f"give it again: load(..., custom_objects={{{name!r}: ...}})"
-            )
-        if name in CHECKS and not CHECKS[name](value):
-            raise ValueError(f"its {name} is {str(value)[:80]!r}")
-    if isinstance(decoded.get("train_freq"), list):
-        decoded["train_freq"] = tuple(decoded["train_freq"])
-    policy = custom.get("policy", custom.get("policy_class", data["policy"]))
-    if not isinstance(policy, str | type):
-        raise ValueError(
-            f"its policy was {values.decode(policy)}, which no file can hold; give it again: "
-            "load(..., custom_objects={'policy': ...})"
-        )
-    # The stored arguments are complete: the preset must not fill anything in.
-    preset = decoded.pop("preset", "paper")
-    model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
-    model.preset = preset
+    """Everything but the networks.
+
+    :raises CallersError: if the file alone would have been in order
+    """
+    try:
+        return _prepare(algorithm, data, env, device, custom, kwargs)
+    except Exception as error:
+        if not custom and not kwargs:
+            raise
+        given = {**custom, **kwargs}
+        try:
+            _prepare(algorithm, data, env, device, {name: given[name] for name in needed(data) if name in given}, {})
+        except Exception:
+            raise error from None
+        raise CallersError(error) from None
+
+
+def _prepare(
+    algorithm: type[Model],
+    data: dict[str, Any],
+    env: VecEnv | None,
+    device: th.device,
+    custom: dict[str, Any],
+    kwargs: dict[str, Any],
+) -> Model:
+    model = blank(algorithm, data, device, custom, kwargs)
+    restore_fields(model, data)
+    if env is not None:
+        check_for_correct_spaces(env, model.observation_space, model.action_space)
+        model.env, model.n_envs = env, env.num_envs
+        model._vec_normalize_env = unwrap_vec_normalize(env)
+    model._prepare()
     return model
-
-
-def _restore_fields(model: DreamerV2, data: dict[str, Any]) -> None:
-    model.observation_space = values.decode(data["observation_space"])
-    model.action_space = values.decode(data["action_space"])
-    for name in COUNTERS:
-        value = data["counters"][name.lstrip("_")]
-        if type(value) is not int or not 0 <= value < 2**62:
-            raise ValueError(f"its counter {name.lstrip('_')} is {str(value)[:80]!r}")
-        setattr(model, name, value)
-    if not isinstance(data["phase"], str) or data["phase"] not in phases.PHASES:
-        raise ValueError(f"its phase is {str(data['phase'])[:80]!r}; known are {sorted(phases.PHASES)}")
-    if not (data["domain"] is None or isinstance(data["domain"], str)):
-        raise ValueError("its domain is no text")
-    if type(data["n_envs"]) is not int or not 1 <= data["n_envs"] <= MAX_ENVS:
-        raise ValueError(f"its n_envs is {str(data['n_envs'])[:80]}")
-    if not is_finite_number(data["progress_remaining"]):
-        raise ValueError("its progress_remaining is no number")
-    model.phase, model.domain, model.n_envs = data["phase"], data["domain"], data["n_envs"]
-    model._current_progress_remaining = float(data["progress_remaining"])
-    episodes = data["episodes"]
-    if not all(set(info) == {"r", "l", "t"} and all(is_finite_number(value) for value in info.values()) for info in episodes):
-        raise ValueError("its statistics of episodes are damaged")
-    model.ep_info_buffer = deque(episodes, maxlen=model._stats_window_size)
-    model.ep_success_buffer = deque(maxlen=model._stats_window_size)
-
-
-def _attach(model: DreamerV2, env: GymEnv | str) -> None:
-    wrapped = model._wrap_env(maybe_make_env(env, model.verbose), model.verbose)
-    check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
-    model.env, model.n_envs = wrapped, wrapped.num_envs
-    model._vec_normalize_env = unwrap_vec_normalize(wrapped)
 
 
 def _build_checked(model: DreamerV2, archive: Archive) -> None:
     """Build the networks only after the file's tensors turned out to be of just their sizes."""
-    found = tensors.read_table(archive, TENSORS)
-    expected = {f"policy.{name}": entry for name, entry in tensors.table_without_memory(model._new_policy, found).items()}
+    found, _ = normalization.split(tensors.read_table(archive, TENSORS))
+    described = tensors.table_without_memory(lambda: model._new_policy(model._intrinsic()), found)
+    expected = {f"policy.{name}": entry for name, entry in described.items()}
     tensors.compare({name: entry for name, entry in found.items() if name.startswith("policy.")}, expected)
     model.set_random_seed(model.seed)
     model._build()
@@ -288,10 +204,11 @@ def set_parameters(model: DreamerV2, source: Target, exact_match: bool) -> None:
     """
     with reading(source, KIND) as archive:
         own = tensors.table_of(_named(model.policy))
-        found = tensors.read_table(archive, TENSORS)
+        found, _ = normalization.split(tensors.read_table(archive, TENSORS))
         if exact_match:
             tensors.compare(found, _with_moments(model, own, found))
-            _put(model, tensors.unpack(archive, TENSORS))
+            loaded = tensors.unpack(archive, TENSORS)
+            _put(model, {name: loaded[name] for name in found})
             return
         common = own.keys() & found.keys()
         tensors.compare({name: found[name] for name in common}, {name: own[name] for name in common})

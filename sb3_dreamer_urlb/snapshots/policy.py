@@ -40,6 +40,7 @@ def load(kind: type[Policy], source: Target, device: th.device | str, custom_obj
     :param custom_objects: constructor arguments that no file can hold
     :raises SnapshotError: naming the file and why it is refused
     """
+    device = get_device(device)
     with reading(source, KIND) as archive:
         if set(archive.data) != {"parameters"}:
             raise ValueError("it has other fields than it should")
@@ -55,7 +56,7 @@ def load(kind: type[Policy], source: Target, device: th.device | str, custom_obj
         tensors.compare(found, tensors.table_without_memory(lambda: kind(lr_schedule=_no_schedule, **parameters), found))
         policy = kind(lr_schedule=_no_schedule, **parameters)
         policy.load_state_dict(tensors.unpack(archive, TENSORS))
-        return policy.to(get_device(device))
+        return policy.to(device)
 
 
 def _no_schedule(_: float) -> float:

@@ -7,9 +7,10 @@ import os
 import runpy
 import sys
 from collections.abc import Sequence
+from unittest import mock
 
 COMMANDS = {
-    "train": "train, go on from a snapshot (-i) or search for hyperparameters (-optimize)",
+    "train": "train, go on with a run or from a snapshot (-i), search for hyperparameters (-optimize)",
     "enjoy": "play episodes with a trained model",
     "record_video": "the same, into an .mp4",
     "plot": "draw the learning curves of runs; --output FILE writes the picture",
@@ -40,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         import rl_zoo3
 
         from sb3_dreamer_urlb.zoo.registration import register
+        from sb3_dreamer_urlb.zoo.resuming import with_runs
     except ModuleNotFoundError as error:
         print(f"{parser.prog}: {error}; pip install 'sb3_dreamer_urlb[zoo]'", file=sys.stderr)
         return 2
@@ -52,7 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("No display: playing without a window (--no-render); record_video makes a film.")
         rest = [*rest, "--no-render"]
     sys.argv = [f"{parser.prog} {command}", *rest]
-    runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+    with mock.patch.object(argparse.ArgumentParser, "parse_args", with_runs(argparse.ArgumentParser.parse_args)):
+        runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
     return 0
 
 

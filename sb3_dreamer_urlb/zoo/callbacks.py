@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
-
 from sb3_dreamer_urlb.phases import SNAPSHOT_FRAMES, SnapshotCallback
 
 
@@ -33,22 +30,3 @@ class RunSnapshotCallback(SnapshotCallback):
     def _init_callback(self) -> None:
         if self.save_path:
             super()._init_callback()
-
-
-class FiniteWeightsCallback(BaseCallback):
-    """Stop a run whose weights have become NaN or infinite; rl_zoo3's ``-optimize`` prunes on the ValueError.
-
-    :raises ValueError: before the next rollout, naming the part of the agent
-    """
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        names, values = zip(*self.model.policy.named_parameters(), strict=True)
-        # One transfer from the device, not one a tensor; a sum is finite only where all of its terms are.
-        finite = th.stack([value.detach().sum() for value in values]).isfinite().tolist()
-        if not all(finite):
-            raise ValueError(
-                f"The weights {names[finite.index(False)]} are not finite after {self.model.num_timesteps} steps."
-            )

@@ -1,4 +1,4 @@
-"""Puts DreamerV2 into rl_zoo3, and mends the three places where rl_zoo3 knows nothing of phases (spec/sb3-plugin).
+"""Puts DreamerV2 into rl_zoo3, and mends the places where rl_zoo3 knows nothing of phases and of runs that go on.
 
 rl_zoo3 has no entry points: its modules share two dictionaries and a class, which are changed here in place.
 """
@@ -7,28 +7,31 @@ from __future__ import annotations
 
 import functools
 import importlib
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from pprint import pprint
 from typing import Any
 from unittest import mock
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
-from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
+from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
+from sb3_dreamer_urlb.zoo import resuming
+from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
 
 #: rl_zoo3's name of the algorithm; the hub looks for the class's name in lower case
 ALGORITHM = "dreamerv2"
 #: what ``train`` reads without ``-conf``, in a checkout of the repository: the first of these that knows the environment
 DEFAULT_CONFIGS = [Path(__file__).parents[2] / "zoo_configs" / name for name in ("lbs.yml", "vectors.yml")]
-#: by name, because rl_zoo3 makes one for each trial
-FINITE = f"{FiniteWeightsCallback.__module__}.{FiniteWeightsCallback.__qualname__}"
 
 
 def register() -> None:
@@ -61,36 +64,101 @@ def _wrap(original: Callable[..., Any], around: Callable[..., Any]) -> Callable[
 
 
 def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Without ``-conf``, rl_zoo3 would look for a file inside its own package.
+    """Without ``-conf``, rl_zoo3 would look for a file inside its own package; a run that goes on has its own.
 
-    :raises ValueError: if there is no file to read
+    Two keys are ours: ``resume: auto``, and ``checkpoint``, False or the keyword arguments of RunCheckpointCallback.
+
+    :raises ValueError: if there is no file to read, or for values of the two keys that mean nothing
+    :raises RuntimeError: for a run that is still going
     """
-    if getattr(manager.args, "conf_file", manager.config) is None:
-        there = [path for path in DEFAULT_CONFIGS if path.is_file()]
-        if not there:
-            raise ValueError("Name a configuration with -conf; this package's repository has some in zoo_configs/.")
-        knowing = [path for path in there if manager.env_name.gym_id in yaml.safe_load(path.read_text())]
-        # Of an environment that none of them knows, rl_zoo3 complains itself.
-        manager.config = str((knowing or there)[0])
-    return original(manager)
+    options = manager.args
+    run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
+    if run is not None and getattr(options, "conf_file", manager.config) is None:
+        hyperparams = {**resuming.saved(run, "config"), **(manager.custom_hyperparams or {})}
+        config = dict(sorted(hyperparams.items()))
+        print(f"Hyperparameters of the run in {run}:")
+        pprint(config)
+    else:
+        if getattr(options, "conf_file", manager.config) is None:
+            manager.config = str(_default_config(manager.env_name.gym_id))
+        hyperparams, config = original(manager)
+    resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
+    checkpoint = hyperparams.pop("checkpoint", True)
+    if resume not in (None, resuming.AUTO):
+        raise ValueError(f"resume must be 'auto' or false, got {resume!r}.")
+    if not isinstance(checkpoint, bool | dict):
+        raise ValueError(f"checkpoint must be true, false or keyword arguments of RunCheckpointCallback, got {checkpoint!r}.")
+    if manager.optimize_hyperparameters:
+        return hyperparams, config
+    manager.checkpoint_options = {} if checkpoint is True else checkpoint
+    if run is None and resume is not None:
+        run = _find_run(manager, config, hyperparams)
+    if run is not None:
+        _go_on(manager, run)
+    return hyperparams, config
+
+
+def _default_config(env_id: str) -> Path:
+    there = [path for path in DEFAULT_CONFIGS if path.is_file()]
+    if not there:
+        raise ValueError("Name a configuration with -conf; this package's repository has some in zoo_configs/.")
+    knowing = [path for path in there if env_id in yaml.safe_load(path.read_text())]
+    # Of an environment that none of them knows, rl_zoo3 complains itself.
+    return (knowing or there)[0]
+
+
+def _find_run(manager: Any, config: dict[str, Any], hyperparams: dict[str, Any]) -> Path | None:
+    steps = manager.n_timesteps if manager.n_timesteps > 0 else int(hyperparams["n_timesteps"])
+    # Otherwise rl_zoo3 has drawn one.
+    seed = manager.seed if any(option.split("=")[0] == "--seed" for option in sys.argv) else None
+    run = resuming.latest_unfinished(manager.log_path, manager.env_name, config, steps, seed, manager.trained_agent)
+    if run is None:
+        print("No unfinished run of this configuration: a new one begins.")
+    else:
+        manager.seed = resuming.saved(run, "args")["seed"]
+    return run
+
+
+def _go_on(manager: Any, run: Path) -> None:
+    """In the run's own folder, where rl_zoo3 would begin a new one."""
+    if resuming.is_going(run):
+        raise RuntimeError(f"Another process is at work in {run}.")
+    manager.save_path, manager.params_path = str(run), str(run / manager.env_name)
+    if resuming.has_checkpoint(run):
+        manager.resumed_run, manager.continue_training = run, True
+    else:
+        print(f"{run} has no checkpoint yet: the run begins.")
+
+
+def _save_config(original: Callable[..., Any], manager: Any, config: dict[str, Any]) -> None:
+    """How a run began stays as it is."""
+    if getattr(manager, "resumed_run", None) is None:
+        original(manager, config)
+    else:
+        print(f"Log path: {manager.save_path}")
 
 
 def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> VecEnv:
-    """``--vec-env subproc`` survives processes that die or hang."""
+    """``--vec-env subproc`` survives processes that die or hang; a run that goes on keeps the episodes it had."""
+    if getattr(manager, "resumed_run", None) is not None and not (kwargs.get("eval_env") or kwargs.get("no_log")):
+        resuming.put_monitor_files_aside(manager.resumed_run)
     if manager.vec_env_class is SubprocVecEnv:
         manager.vec_env_class = SupervisedVecEnv
     return original(manager, *args, **kwargs)
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
-    """Tell the snapshots their folder, whose number rl_zoo3 chooses; let each trial of ``-optimize`` stop at NaN."""
+    """Tell the snapshots their folder, whose number rl_zoo3 chooses; keep the run, so that ``-i`` can go on with it."""
     original(manager)
-    if manager.optimize_hyperparameters:
-        given = manager.specified_callbacks or []
-        manager.specified_callbacks = [*(given if isinstance(given, list) else [given]), FINITE]
     for callback in manager.callbacks:
         if isinstance(callback, RunSnapshotCallback):
             callback.save_path = str(Path(manager.save_path) / "snapshots")
+    kept = any(isinstance(callback, RunCheckpointCallback) for callback in manager.callbacks)
+    if manager.optimize_hyperparameters or manager.checkpoint_options is False or kept:
+        return
+    evaluation = next((callback for callback in manager.callbacks if isinstance(callback, EvalCallback)), None)
+    options = {"evaluation": evaluation, "verbose": int(manager.verbose > 0), "resume": "auto", **manager.checkpoint_options}
+    manager.callbacks.append(RunCheckpointCallback(Path(manager.save_path) / resuming.CHECKPOINT, **options))
 
 
 def _load_pretrained_agent(
@@ -98,20 +166,34 @@ def _load_pretrained_agent(
 ) -> BaseAlgorithm:
     """``-i`` takes a snapshot's networks from the snapshot, and only takes a replay buffer that belongs to its phase.
 
+    A run that goes on takes everything from its checkpoint, but for what the command line changes.
+
     :raises ValueError: for a snapshot that was made with other networks than the configuration says
     """
-    expected = {name: hyperparams.pop(name) for name in ("preset", "intrinsic_reward") if name in hyperparams}
+    expected: dict[str, Any] = {name: hyperparams.pop(name) for name in ("preset", "intrinsic_reward") if name in hyperparams}
+    if getattr(manager, "resumed_run", None) is not None:
+        changed = {name: hyperparams[name] for name in manager.custom_hyperparams or {} if name in hyperparams}
+        own = {"tensorboard_log": manager.tensorboard_log, "verbose": manager.verbose}
+        folder = manager.resumed_run / resuming.CHECKPOINT
+        resumed = DreamerV2.resume(folder, env, device=manager.device, **{**own, **changed})
+        assert resumed is not None
+        _check_expected(manager.resumed_run, expected, resumed)
+        return resumed
     fine_tunes = any(isinstance(callback, FineTuneCallback) for callback in manager.callbacks)
     load = functools.partialmethod(_load_fitting_buffer, DreamerV2.load_replay_buffer, fine_tunes)
     with mock.patch.object(DreamerV2, "load_replay_buffer", load):
         model = original(manager, hyperparams, env)
+    _check_expected(manager.trained_agent, expected, model)
+    return model
+
+
+def _check_expected(source: str | Path, expected: dict[str, Any], model: BaseAlgorithm) -> None:
     for name, value in expected.items():
         if value != getattr(model, name):
             raise ValueError(
-                f"{manager.trained_agent} was made with {name}={getattr(model, name)!r}, the configuration says {value!r}: "
+                f"{source} was made with {name}={getattr(model, name)!r}, the configuration says {value!r}: "
                 "a snapshot keeps its networks."
             )
-    return model
 
 
 def _load_fitting_buffer(
@@ -132,4 +214,5 @@ _AROUND: dict[str, Callable[..., Any]] = {
     "create_envs": _create_envs,
     "create_callbacks": _create_callbacks,
     "_load_pretrained_agent": _load_pretrained_agent,
+    "_save_config": _save_config,
 }

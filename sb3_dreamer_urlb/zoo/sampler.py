@@ -1,4 +1,4 @@
-"""What rl_zoo3's ``-optimize`` tries. A trial whose weights become NaN is pruned (``FiniteWeightsCallback``)."""
+"""What rl_zoo3's ``-optimize`` tries. A trial that no longer learns is pruned (``NumericalFaultError``)."""
 
 from __future__ import annotations
 

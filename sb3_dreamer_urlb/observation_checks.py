@@ -1,0 +1,50 @@
+"""What ``predict`` is handed in as an observation: numbers of the right shape, or one error that says what was expected."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+Observation = np.ndarray | dict[str, np.ndarray]
+
+
+def checked_observation(observation: Any, space: spaces.Space[Any]) -> Observation:
+    """As arrays; what is left to Stable-Baselines3's own checks has numbers in it, and an image's number of axes.
+
+    :param observation: of one environment or with a leading n; arrays, or what numpy makes one of, or such by name
+    :param space: of one environment, images with channels first
+    :raises ValueError: naming what was given and what was expected
+    """
+    if isinstance(observation, tuple):
+        raise ValueError("predict() takes the observation, got a tuple: Gymnasium's `obs, info = env.reset()`?")
+    if isinstance(space, spaces.Dict):
+        if not isinstance(observation, dict):
+            raise ValueError(f"The observation must be a dictionary of {sorted(space.keys())}, got {_shown(observation)}.")
+        unknown = sorted(set(observation) - set(space.keys()))
+        if unknown:
+            raise ValueError(f"The observation has the parts {unknown}; known are {sorted(space.keys())}.")
+        return {name: _array(f"The observation {name!r}", part, space[name]) for name, part in observation.items()}
+    # A dictionary is refused by Stable-Baselines3, which names the space.
+    return observation if isinstance(observation, dict) else _array("The observation", observation, space)
+
+
+def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
+    shape: tuple[int, ...] = space.shape or ()
+    try:
+        array = np.asarray(value)
+        numbers = array.dtype.kind in "biuf"
+    except ValueError:  # rows of different lengths
+        numbers = False
+    if not numbers:
+        raise ValueError(f"{name} must be numbers of the shape {shape}, or (n, *{shape}), got {_shown(value)}.")
+    if len(shape) == 3 and array.ndim not in (3, 4):
+        raise ValueError(
+            f"{name} must have the shape {shape}, its channels first or last, or with a leading n: got {array.shape}."
+        )
+    return array
+
+
+def _shown(value: Any) -> str:
+    return f"{type(value).__name__} {str(value)[:80]!r}"

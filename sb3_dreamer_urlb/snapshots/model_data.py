@@ -1,0 +1,174 @@
+"""The JSON of a model's file ↔ the model: constructor arguments, counters, phase, random states, statistics of episodes."""
+
+from __future__ import annotations
+
+import inspect
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch as th
+
+from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
+from sb3_dreamer_urlb.snapshots import values
+from sb3_dreamer_urlb.snapshots.random_state import capture
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+Model = TypeVar("Model", bound="DreamerV2")
+
+#: constructor arguments that are the loader's business
+NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
+#: arguments whose attribute SB3 calls otherwise
+ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
+COUNTERS = (
+    "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates",
+    "phase_timesteps", "phase_updates", "phase_frames", "action_repeat", "env_faults", "skipped_updates",
+)  # fmt: skip
+FIELDS = {
+    "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "counters",
+    "progress_remaining", "random", "episodes", "run",
+}  # fmt: skip
+MAX_ENVS = 65_536
+#: whose statistics are kept
+MAX_EPISODES = 1000
+
+
+def _is_dict_or_none(value: Any) -> bool:
+    return value is None or isinstance(value, dict)
+
+
+#: arguments that nobody else checks
+CHECKS: dict[str, Callable[[Any], bool]] = {
+    "verbose": lambda value: is_integer(value) and 0 <= value <= 2,
+    "stats_window_size": lambda value: is_integer(value) and 1 <= value <= 1_000_000,
+    "seed": lambda value: value is None or (is_integer(value) and 0 <= value < 2**32),
+    "tensorboard_log": lambda value: value is None or isinstance(value, str),
+    "preset": lambda value: isinstance(value, str),
+    "discount_head": lambda value: value is None or isinstance(value, bool),
+    "policy_kwargs": _is_dict_or_none,
+    "intrinsic_kwargs": _is_dict_or_none,
+    "planner_kwargs": _is_dict_or_none,
+    "replay_buffer_kwargs": _is_dict_or_none,
+}
+
+
+def describe(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
+    """All of a model but its tensors, as JSON.
+
+    :param model: what to describe
+    :param run: what a run folder adds, JSON
+    """
+    aliases = [alias for alias, known in model.policy_aliases.items() if known is model.policy_class]
+    return {
+        "policy": aliases[0] if aliases else values.encode_or_describe(model.policy_class),
+        "arguments": describe_arguments(model),
+        "observation_space": values.encode(model.observation_space),
+        "action_space": values.encode(model.action_space),
+        "n_envs": model.n_envs,
+        "phase": model.phase,
+        "domain": values.encode(model.domain),
+        "counters": {name.lstrip("_"): values.encode(getattr(model, name)) for name in COUNTERS},
+        "progress_remaining": float(model._current_progress_remaining),
+        "random": capture(model),
+        "episodes": [
+            {key: float(info[key]) for key in ("r", "l", "t")}
+            for info in list(model.ep_info_buffer or ())[-MAX_EPISODES:]
+            if all(is_finite_number(info.get(key)) for key in ("r", "l", "t"))
+        ],
+        "run": run,
+    }
+
+
+def describe_arguments(model: DreamerV2) -> dict[str, Any]:
+    """The constructor arguments of a model, as JSON."""
+    arguments = {name: getattr(model, ATTRIBUTES.get(name, name)) for name in argument_names(type(model))}
+    arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
+    return {name: values.encode_or_describe(value) for name, value in arguments.items()}
+
+
+def argument_names(algorithm: type[DreamerV2]) -> list[str]:
+    """The constructor arguments that files hold."""
+    return [name for name in inspect.signature(algorithm.__init__).parameters if name not in NOT_STORED]
+
+
+def blank(
+    algorithm: type[Model], data: dict[str, Any], device: th.device | str, custom: dict[str, Any], kwargs: dict[str, Any]
+) -> Model:
+    """A model with the stored arguments and without networks.
+
+    :param algorithm: its class
+    :param data: of the file
+    :param device: where its networks will be
+    :param custom: replaces arguments; names that are none are ignored
+    :param kwargs: replaces arguments, too
+    :raises ValueError: for arguments that are damaged, or that no file can hold and nobody gave
+    """
+    known = argument_names(algorithm)
+    arguments = dict(data["arguments"])
+    unknown = sorted(set(arguments) - set(known))
+    if unknown:
+        raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
+    given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
+    decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
+    for name, value in decoded.items():
+        if (missing := values.contains_custom(value)) is not None:
+            raise ValueError(
+                f"its {name} was {missing.description}, which no file can hold; "
+                f"give it again: load(..., custom_objects={{{name!r}: ...}})"
+            )
+        if name in CHECKS and not CHECKS[name](value):
+            raise ValueError(f"its {name} is {str(value)[:80]!r}")
+    if isinstance(decoded.get("train_freq"), list):
+        decoded["train_freq"] = tuple(decoded["train_freq"])
+    policy = custom.get("policy", custom.get("policy_class", data["policy"]))
+    if not isinstance(policy, str | type):
+        raise ValueError(
+            f"its policy was {values.decode(policy)}, which no file can hold; give it again: "
+            "load(..., custom_objects={'policy': ...})"
+        )
+    # The stored arguments are complete: the preset must not fill anything in.
+    preset = decoded.pop("preset", "paper")
+    model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
+    model.preset = preset
+    return model
+
+
+def needed(data: dict[str, Any]) -> list[str]:
+    """The names of what no file can hold: the caller must give it."""
+    stored = {"policy": data["policy"], **data["arguments"]}
+    names = [name for name, value in stored.items() if values.contains_custom(values.decode(value)) is not None]
+    return names + ["policy_class"] * ("policy" in names)
+
+
+def restore_fields(model: DreamerV2, data: dict[str, Any]) -> None:
+    """Everything that is neither argument nor tensor.
+
+    :param model: blank
+    :param data: of the file
+    :raises ValueError: for fields of wrong types or ranges
+    """
+    model.observation_space = values.decode(data["observation_space"])
+    model.action_space = values.decode(data["action_space"])
+    for name in COUNTERS:
+        value = data["counters"][name.lstrip("_")]
+        if type(value) is not int or not 0 <= value < 2**62:
+            raise ValueError(f"its counter {name.lstrip('_')} is {str(value)[:80]!r}")
+        setattr(model, name, value)
+    if not isinstance(data["phase"], str) or data["phase"] not in phases.PHASES:
+        raise ValueError(f"its phase is {str(data['phase'])[:80]!r}; known are {sorted(phases.PHASES)}")
+    if not (data["domain"] is None or isinstance(data["domain"], str)):
+        raise ValueError("its domain is no text")
+    if type(data["n_envs"]) is not int or not 1 <= data["n_envs"] <= MAX_ENVS:
+        raise ValueError(f"its n_envs is {str(data['n_envs'])[:80]}")
+    if not is_finite_number(data["progress_remaining"]):
+        raise ValueError("its progress_remaining is no number")
+    model.phase, model.domain, model.n_envs = data["phase"], data["domain"], data["n_envs"]
+    model._current_progress_remaining = float(data["progress_remaining"])
+    episodes = data["episodes"]
+    if not all(set(info) == {"r", "l", "t"} and all(is_finite_number(value) for value in info.values()) for info in episodes):
+        raise ValueError("its statistics of episodes are damaged")
+    model.ep_info_buffer = deque(episodes, maxlen=model._stats_window_size)
+    model.ep_success_buffer = deque(maxlen=model._stats_window_size)
