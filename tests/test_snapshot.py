@@ -74,7 +74,10 @@ def same(one, two):
         ]
         for model in (one, two)
     ]
-    counters = ("num_timesteps", "_n_updates", "phase", "phase_timesteps", "phase_updates", "phase_frames", "n_envs", "seed")
+    counters = (
+        "num_timesteps", "_n_updates", "phase", "phase_timesteps", "phase_updates", "phase_frames", "pretrained_frames",
+        "n_envs", "seed",
+    )  # fmt: skip
     return (
         all(th.equal(first[name], second[name]) for name in first)
         and len(moments[0]) == len(moments[1]) > 0
@@ -563,6 +566,14 @@ def test_a_file_of_version_1_is_brought_up_to_date(saved, tmp_path):
     assert same(load(path), saved[0])
     refused(with_version(saved[1], tmp_path / "wrong.zip", 2, old), "other fields")
     assert set(MIGRATIONS) == set(range(1, VERSION))
+
+
+def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
+    """It did not say how long the pre-training was."""
+    data = json.loads(members(saved[1])["data"])
+    old = {**data, "counters": {name: value for name, value in data["counters"].items() if name != "pretrained_frames"}}
+    assert load(with_version(saved[1], tmp_path / "old.zip", 2, old)).pretrained_frames == 0
+    refused(with_version(saved[1], tmp_path / "wrong.zip", 3, old), "pretrained_frames")
 
 
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])

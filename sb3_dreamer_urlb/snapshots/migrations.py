@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 #: of the files written now; goes up with every change that older code could not read
-VERSION = 2
+VERSION = 3
 
 
 def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
@@ -16,7 +16,14 @@ def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1}
+def _from_2(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Version 3 added how long the pre-training was that a model was fine-tuned from; 0 where nobody knows."""
+    if kind == "model":
+        return {**data, "counters": {**data["counters"], "pretrained_frames": 0}}
+    return data
+
+
+MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2}
 
 
 def migrate(kind: str, data: dict[str, Any], version: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
+from sb3_dreamer_urlb.videos import VideoCallback
 from sb3_dreamer_urlb.zoo.callbacks import FiniteWeightsCallback, RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
 
@@ -79,7 +80,7 @@ def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwarg
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
-    """Tell the snapshots their folder, whose number rl_zoo3 chooses; let each trial of ``-optimize`` stop at NaN."""
+    """Tell snapshots and films their folder, whose number rl_zoo3 chooses; let each trial of ``-optimize`` stop at NaN."""
     original(manager)
     if manager.optimize_hyperparameters:
         given = manager.specified_callbacks or []
@@ -87,6 +88,8 @@ def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
     for callback in manager.callbacks:
         if isinstance(callback, RunSnapshotCallback):
             callback.save_path = str(Path(manager.save_path) / "snapshots")
+        if isinstance(callback, VideoCallback) and callback.folder is None:
+            callback.folder = Path(manager.save_path) / "videos"
 
 
 def _load_pretrained_agent(
