@@ -25,7 +25,7 @@ from sb3_dreamer_urlb.zoo.registration import ALGORITHM
 CONFIG, ARGUMENTS, ENV_KWARGS, METRICS = "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip"
 #: of the command line that trained; the rest names things of that machine
 SHARED_ARGUMENTS = ("algo", "env", "env_kwargs", "seed", "n_timesteps")
-MAX_YAML = 1 << 20
+MAX_YAML = 64 << 10
 
 
 def push(argv: Sequence[str], prog: str) -> str:
