@@ -102,3 +102,20 @@ def test_every_local_link_leads_somewhere():
     for page in (ROOT / "README.md", ROOT / "SECURITY.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_logging_and_films(small_world, tmp_path, monkeypatch):
+    [block] = code_blocks("docs/logging.md")
+    block = block.replace("VideoCallback(video_freq=50_000)", "VideoCallback(gymnasium.make('walker'), video_freq=60)")
+    names = run(block.replace("EvalCallback(eval_env", "EvalCallback(eval_env, n_eval_episodes=1"), {})
+    assert names["model"].num_timesteps >= 360
+    assert {"progress.csv", "progress.json"} <= {path.name for path in (tmp_path / "logs").iterdir()}
+    assert "eval/mean_reward" in (tmp_path / "logs" / "progress.json").read_text()
+
+
+def test_sharing(small_world, tmp_path):
+    [block] = code_blocks("docs/hub.md")
+    block = block.replace('"./shared/walker-run",', '"./shared/walker-run", gymnasium.make("x"), env_id="urlb/walker-run-v0",')
+    names = run(block, {})
+    assert names["path"] == str(tmp_path / "shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
+    assert names["model"].phase == "finetuning" and "python train.py" in (tmp_path / "shared/walker-run/README.md").read_text()

@@ -132,7 +132,7 @@ def test_the_page_names_what_exists():
         assert set(re.findall(r"urlb/\S+", options)) < set(gymnasium.registry)
         assert [(ROOT / path).is_file() for path in re.findall(r"-conf (\S+)", options)] == [True] * (command == "train")
     [own] = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]).values()
-    assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 2
+    assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 3
 
 
 # -- the commands ----------------------------------------------------------------------------------------------------------
