@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.replay import SequenceReplayBuffer
     from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
     from sb3_dreamer_urlb.snapshots import SnapshotError
+    from sb3_dreamer_urlb.videos import VideoCallback
 
 _MODULES = {
     "CnnPolicy": "policies",
@@ -34,6 +35,7 @@ _MODULES = {
     "SequenceReplayBuffer": "replay",
     "SnapshotCallback": "phases",
     "SnapshotError": "snapshots",
+    "VideoCallback": "videos",
     "register_intrinsic_reward": "intrinsic",
 }
 
@@ -52,6 +54,7 @@ __all__ = [
     "SequenceReplayBuffer",
     "SnapshotCallback",
     "SnapshotError",
+    "VideoCallback",
     "register_envs",
     "register_intrinsic_reward",
 ]

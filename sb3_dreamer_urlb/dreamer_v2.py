@@ -204,6 +204,9 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.phase_updates = 0
         #: environment frames seen in the phase: agent steps × action repeat
         self.phase_frames = 0
+        #: environment frames of the pre-training that this model was fine-tuned from
+        self.pretrained_frames = 0
+        self._logged_phase: str | None = None
         #: environment frames an agent step
         self.action_repeat = 1
         #: faults that environments' guards reported so far
@@ -352,7 +355,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         if keep_actor is None:
             keep_actor = phases.keeps_actor(self.domain)
         pretrained = self.policy.agent
-        self.phase = phases.FINETUNING
+        self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
         del self.replay_buffer
         self._build()
@@ -452,6 +455,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self.run_folder is not None:
             self.run_folder.restore_normalization(self)
+        self._logged_phase = None
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._vec_normalize_env)
         return result
@@ -492,6 +496,9 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/skipped_updates", self.skipped_updates)
         self.logger.record("rollout/env_faults", self.env_faults)
-        self.logger.record("time/phase", self.phase, exclude="tensorboard")
+        # TensorBoard shows texts one by one: once a phase will do.
+        self.logger.record("time/phase", self.phase, exclude="tensorboard" if self.phase == self._logged_phase else None)
+        self._logged_phase = self.phase
         self.logger.record("time/phase_frames", self.phase_frames)
+        self.logger.record("time/total_frames", self.num_timesteps * self.action_repeat)
         super().dump_logs()

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parent.parent
 OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]
 PAGES = [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
+TASK = 'gymnasium.make("urlb/walker-run-v0")'
 # What makes an example small: numbers of frames and steps.
 SMALL = {
     "2_000_000": "480",
@@ -207,3 +208,20 @@ def pages_and_code_come_from_outside_of_docs(site):
     code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
     assert "class LBS" in re.sub(r"<[^>]*>", "", code)
     assert "PRETRAIN_FRAMES" in (site / "quickstart/index.html").read_text()
+
+
+def test_logging_and_films(small_world, tmp_path, monkeypatch):
+    [block] = code_blocks("docs/logging.md")
+    block = block.replace("VideoCallback(video_freq=50_000)", f"VideoCallback({TASK}, video_freq=60)")
+    names = run(block.replace("EvalCallback(eval_env", "EvalCallback(eval_env, n_eval_episodes=1"), {})
+    assert names["model"].num_timesteps >= 360
+    assert {"progress.csv", "progress.json"} <= {path.name for path in (tmp_path / "logs").iterdir()}
+    assert "eval/mean_reward" in (tmp_path / "logs" / "progress.json").read_text()
+
+
+def test_sharing(small_world, tmp_path):
+    [block] = code_blocks("docs/hub.md")
+    block = block.replace('"./shared/walker-run",', f'"./shared/walker-run", {TASK}, env_id="urlb/walker-run-v0",')
+    names = run(block, {})
+    assert names["path"] == str(tmp_path / "shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
+    assert names["model"].phase == "finetuning" and "python train.py" in (tmp_path / "shared/walker-run/README.md").read_text()

@@ -182,10 +182,12 @@ def test_one_snapshot_fine_tuned_twice_keeps_the_same(pretrained, weights, tmp_p
 
 def test_a_fine_tuned_model_is_saved_and_loaded_as_such(pretrained, weights, tmp_path):
     model = pretrained()
+    frames = model.phase_frames
     model.fine_tune()
     model.learn(24).save(tmp_path / "finetuned")
     loaded = DreamerV2.load(tmp_path / "finetuned", env=vec_env(), device="cpu")
     assert loaded.phase == "finetuning" and loaded.policy.agent.intrinsic is None and loaded._planner_is_on()
+    assert loaded.pretrained_frames == frames > 0
     assert weights(loaded.policy) == weights(model.policy)
     loaded.learn(24)
 

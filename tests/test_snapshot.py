@@ -74,7 +74,10 @@ def same(one, two):
         ]
         for model in (one, two)
     ]
-    counters = ("num_timesteps", "_n_updates", "phase", "phase_timesteps", "phase_updates", "phase_frames", "n_envs", "seed")
+    counters = (
+        "num_timesteps", "_n_updates", "phase", "phase_timesteps", "phase_updates", "phase_frames", "pretrained_frames",
+        "n_envs", "seed",
+    )  # fmt: skip
     return (
         all(th.equal(first[name], second[name]) for name in first)
         and len(moments[0]) == len(moments[1]) > 0
@@ -566,15 +569,16 @@ def test_a_file_of_version_1_is_brought_up_to_date(saved, tmp_path):
 
 
 def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
-    """It counted neither faults of environments nor skipped updates."""
+    """It counted neither faults of environments, nor skipped updates, nor the frames of the pre-training behind it."""
+    new = ("env_faults", "skipped_updates", "pretrained_frames")
     old = json.loads(members(saved[1])["data"])
-    for name in ("env_faults", "skipped_updates"):
+    for name in new:
         old["counters"][name] = 5
     assert load(with_version(saved[1], tmp_path / "new.zip", VERSION, old)).env_faults == 5
-    for name in ("env_faults", "skipped_updates"):
+    for name in new:
         del old["counters"][name]
     loaded = load(with_version(saved[1], tmp_path / "old.zip", 2, old))
-    assert same(loaded, saved[0]) and (loaded.env_faults, loaded.skipped_updates) == (0, 0)
+    assert same(loaded, saved[0]) and [getattr(loaded, name) for name in new] == [0, 0, 0]
     refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "env_faults")
 
 

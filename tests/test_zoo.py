@@ -8,21 +8,27 @@ import re
 import subprocess
 import sys
 import warnings
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
+import numpy as np
 import pytest
 import rl_zoo3.utils
 import yaml
 from fake_envs import CounterEnv
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from rl_zoo3.exp_manager import ExperimentManager
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from snapshot_files import code_events
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
 from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.zoo import hub as zoo_hub
 from sb3_dreamer_urlb.zoo import registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
@@ -140,7 +146,7 @@ def test_the_page_names_what_exists():
         assert set(re.findall(r"urlb/\S+", options)) < set(gymnasium.registry)
         assert [(ROOT / path).is_file() for path in re.findall(r"-conf (\S+)", options)] == [True] * (command == "train")
     [own] = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]).values()
-    assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 2
+    assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 3
 
 
 # -- the commands ----------------------------------------------------------------------------------------------------------
@@ -354,3 +360,112 @@ def test_processes_are_supervised():
         manager = SimpleNamespace(vec_env_class=given)
         assert registration._create_envs(lambda its, n: (its.vec_env_class, n), manager, 3) == (used, 3)
     assert hasattr(ExperimentManager.create_envs, "_of_dreamer_v2")
+
+
+# -- sharing ---------------------------------------------------------------------------------------------------------------
+
+SHARE = ["--algo", "dreamerv2", "--env", STAND, "-orga", "./hub"]
+NORMALISED = f"""
+{STAND}:
+  n_timesteps: 40
+  policy: MlpPolicy
+  preset: tiny
+  normalize: "{{'norm_obs': True, 'norm_reward': False}}"
+"""
+
+
+def test_a_run_is_shared_and_played_elsewhere(zoo, capsys):
+    run = train(zoo, STAND, 60, "lbs", "--eval-freq", "30", "--eval-episodes", "1", params=TINY)
+    zoo("push_to_hub", *SHARE, "-f", "logs", "-n", "6", "--n-eval-episodes", "2", "--device", "cpu")
+    repository = Path("hub/dreamerv2-urlb-walker-stand-v0")
+    assert {path.name for path in repository.iterdir()} == {
+        "dreamerv2-urlb-walker-stand-v0.zip", "README.md", "config.json", "results.json", "replay.mp4",
+        "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip",
+    }  # fmt: skip
+    card = (repository / "README.md").read_text()
+    assert (run / STAND.replace("/", "-") / "command.txt").read_text().strip() in card
+    assert "| frames | 80 of pre-training, then 40 on the task" in card and "10.00 +/- 0.00" in card
+    assert yaml.safe_load((repository / "args.yml").read_text())["seed"] == 1
+    with zipfile.ZipFile(repository / "train_eval_metrics.zip") as metrics:
+        assert set(metrics.namelist()) == {"evaluations.npz", "0.monitor.csv"}
+
+    zoo("load_from_hub", *SHARE, "-f", "elsewhere")
+    assert Path("elsewhere/dreamerv2/urlb-walker-stand-v0_1/urlb-walker-stand-v0.zip").is_file()
+    capsys.readouterr()
+    zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "elsewhere", "-n", "21", "--device", "cpu")
+    assert "Mean reward: 10.0" in capsys.readouterr().out
+    # Another one beside it, or in its place.
+    zoo("load_from_hub", *SHARE, "-f", "elsewhere")
+    assert main(["load_from_hub", *SHARE, "-f", "elsewhere", "--exp-id", "2"]) == 2
+    assert "--force overwrites it" in capsys.readouterr().err
+    (Path("elsewhere/dreamerv2/urlb-walker-stand-v0_2") / "old").write_text("")
+    zoo("load_from_hub", *SHARE, "-f", "elsewhere", "--exp-id", "2", "--force")
+    assert not (Path("elsewhere/dreamerv2/urlb-walker-stand-v0_2") / "old").exists()
+
+
+def test_a_normalised_run_is_shared_without_pickles(zoo, monkeypatch, capsys):
+    kwargs = {**CHEAP, "observation_space": spaces.Box(-1, 1, (3,), np.float32)}
+    monkeypatch.setitem(gymnasium.registry, STAND, EnvSpec(STAND, "fake_envs:CounterEnv", kwargs=kwargs))
+    Path("normalised.yml").write_text(NORMALISED)
+    zoo(*TRAIN, "--env", STAND, "-conf", "normalised.yml", "--eval-freq", "-1")
+    zoo("push_to_hub", *SHARE, "-f", "logs", "--no-render", "--n-eval-episodes", "1")
+    repository = Path("hub/dreamerv2-urlb-walker-stand-v0")
+    assert not list(repository.rglob("*.pkl")) and "load_vec_normalize" in (repository / "README.md").read_text()
+    zoo("load_from_hub", *SHARE, "-f", "elsewhere")
+    here, there = (
+        VecNormalize.load(
+            f"{folder}/dreamerv2/urlb-walker-stand-v0_1/urlb-walker-stand-v0/vecnormalize.pkl", make_vec_env(STAND)
+        )
+        for folder in ("logs", "elsewhere")
+    )
+    assert np.array_equal(here.obs_rms.mean, there.obs_rms.mean) and here.obs_rms.count == there.obs_rms.count > 30
+    zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "elsewhere", "-n", "21", "--device", "cpu")
+    (repository / "vec_normalize.json").unlink()
+    assert main(["load_from_hub", *SHARE, "-f", "elsewhere"]) == 2
+    assert "normalize is True" in capsys.readouterr().err
+
+
+def test_mistakes_in_sharing_are_named(zoo, capsys):
+    for arguments, message in (
+        (["push_to_hub", *SHARE, "-f", "logs"], "folder was not found"),
+        (["load_from_hub", *SHARE, "-f", "logs"], "No such file"),
+        (["load_from_hub", *SHARE[:-1], "a/b", "-f", "logs"], "repo_id must be 'user/name'"),
+    ):
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["push_to_hub"])
+    assert not Path("logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ("!!python/object/apply:os.system ['touch hacked']", "is refused"),
+        ("env_wrapper: subprocess.Popen", "names code to run: env_wrapper='subprocess.Popen'"),
+        ("vec_env_wrapper: [{os.system: {}}]", "names code to run"),
+        ("frame_stack: -1", "frame_stack is -1"),
+        ("frame_stack: '4'", "frame_stack is '4'"),
+        ("- 1", "no values by name"),
+        ("1: 2", "no values by name"),
+        ("[" * 500, "is refused"),
+    ],
+)
+def test_a_strangers_configuration_runs_nothing(tmp_path, config, message):
+    path = tmp_path / "config.yml"
+    path.write_text(config)
+    with code_events() as events, pytest.raises(ValueError, match=message):
+        zoo_hub.harmless_config(zoo_hub._read_yaml(str(path)))
+    assert events == []
+
+
+def test_what_is_kept_of_a_strangers_configuration():
+    config = {"normalize": "__import__('os').system('touch hacked')", "callback": "os.system", "frame_stack": 4, "policy": "x"}
+    assert zoo_hub.harmless_config(config) == {"normalize": True, "frame_stack": 4}
+    assert zoo_hub.harmless_config({}) == {"normalize": False}
+
+
+def test_films_go_into_the_runs_folder(zoo):
+    film = "{'sb3_dreamer_urlb.VideoCallback': dict(video_freq=20, video_length=3)}"
+    run = train(zoo, STAND, 40, "scratch", params=["preset:'tiny'", f"callback:[{film}]"])
+    assert {path.name for path in (run / "videos").iterdir()} == {"agent_20.gif", "agent_40.gif"}

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch as th
 
+from sb3_dreamer_urlb.evaluation.gifs import encode_gif
+from sb3_dreamer_urlb.evaluation.open_loop import pictures, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
 from sb3_dreamer_urlb.policies import DreamerPolicy
 
@@ -66,7 +69,6 @@ def learning_curve(points: Sequence[CurvePoint], levels: dict[str, float], title
     plt.close(figure)
 
 
-@th.no_grad()
 def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """What the model thinks happens: it sees a few frames, then only the actions.
 
@@ -76,24 +78,9 @@ def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: 
     :param steps: predicted steps
     :return: truth and prediction, both uint8 (CONTEXT + steps, height, width, C)
     """
-    model, device = policy.agent.world_model, policy.device
-    end = min(start + CONTEXT + steps, len(episode.observations))
-    truth = episode.observations[start:end]
-    scaled = policy.actions.from_env(episode.actions)
-    # Row t holds the action that led to observation t.
-    led = np.concatenate([np.zeros_like(scaled[:1]), scaled])[start:end].reshape(len(truth), -1)
-    action = th.as_tensor(led, dtype=th.float32, device=device)
-    image = model.preprocess(th.as_tensor(truth, device=device).permute(0, 3, 1, 2))[None]  # type: ignore[index]
-    is_first = th.zeros(1, CONTEXT, dtype=th.bool, device=device)
-    is_first[:, 0] = True
-    seen = model.observe(image[:, :CONTEXT], action[None, :CONTEXT], is_first)
-    features = list(seen.feature[0].unbind(0))
-    state = type(seen.state)(seen.state.stoch[:, -1], seen.state.deter[:, -1])
-    for t in range(CONTEXT, len(truth)):
-        state = model.rssm.prior_step(state, action[None, t])
-        features.append(state.feature[0])
-    decoded = (model.decoder(th.stack(features)) + 0.5).clamp(0, 1) * 255
-    return truth, decoded.permute(0, 2, 3, 1).round().to(th.uint8).cpu().numpy()
+    seen = th.as_tensor(episode.observations).permute(0, 3, 1, 2)
+    truth, predicted = predict_open_loop(policy, seen, episode.actions, start, CONTEXT, steps)
+    return pictures(truth), pictures(predicted)
 
 
 def truth_model_error(truth: np.ndarray, model: np.ndarray) -> np.ndarray:
@@ -110,9 +97,4 @@ def write_gif(frames: Sequence[np.ndarray] | np.ndarray, path: str | os.PathLike
     :param fps: frames a second
     :param scale: enlarge each pixel this many times
     """
-    from PIL import Image
-
-    pictures = [Image.fromarray(np.ascontiguousarray(frame)) for frame in frames]
-    size = (pictures[0].width * scale, pictures[0].height * scale)
-    pictures = [picture.resize(size, Image.Resampling.NEAREST) for picture in pictures]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0)
+    Path(path).write_bytes(encode_gif(frames, fps, scale))

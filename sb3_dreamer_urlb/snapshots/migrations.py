@@ -17,9 +17,12 @@ def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _from_2(kind: str, data: dict[str, Any]) -> dict[str, Any]:
-    """Version 3 counts the environments' faults and the skipped updates, and run folders hold VecNormalize's statistics."""
+    """Version 3 counts the environments' faults, the skipped updates, and the frames of the pre-training behind a model.
+
+    Run folders have VecNormalize's statistics since then.
+    """
     if kind == "model" and isinstance(data.get("counters"), dict):
-        return {**data, "counters": {**data["counters"], "env_faults": 0, "skipped_updates": 0}}
+        return {**data, "counters": {**data["counters"], "env_faults": 0, "skipped_updates": 0, "pretrained_frames": 0}}
     return data
 
 

@@ -25,7 +25,7 @@ NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
 ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
 COUNTERS = (
     "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates",
-    "phase_timesteps", "phase_updates", "phase_frames", "action_repeat", "env_faults", "skipped_updates",
+    "phase_timesteps", "phase_updates", "phase_frames", "pretrained_frames", "action_repeat", "env_faults", "skipped_updates",
 )  # fmt: skip
 FIELDS = {
     "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "counters",

@@ -1,4 +1,4 @@
-"""``python -m sb3_dreamer_urlb.zoo train|enjoy|record_video|plot ...``: rl_zoo3's commands with ``--algo dreamerv2``."""
+"""``python -m sb3_dreamer_urlb.zoo train|enjoy|...``: rl_zoo3's commands with ``--algo dreamerv2``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ COMMANDS = {
     "enjoy": "play episodes with a trained model",
     "record_video": "the same, into an .mp4",
     "plot": "draw the learning curves of runs; --output FILE writes the picture",
+    "push_to_hub": "put a model on the Hugging Face Hub, or into a folder, with its card",
+    "load_from_hub": "fetch a model from there into the folder of runs",
 }
 
 
@@ -50,6 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command == "plot":
         _plot(rest)
         return 0
+    if command.endswith("_hub"):
+        return _share(command, rest, f"{parser.prog} {command}")
     if command == "enjoy" and not _has_display() and "--no-render" not in rest and "-h" not in rest:
         print("No display: playing without a window (--no-render); record_video makes a film.")
         rest = [*rest, "--no-render"]
@@ -61,6 +65,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _has_display() -> bool:
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _share(command: str, rest: list[str], prog: str) -> int:
+    from sb3_dreamer_urlb.zoo import hub
+
+    try:
+        print({"push_to_hub": hub.push, "load_from_hub": hub.load}[command](rest, prog))
+    except (ValueError, ImportError, FileNotFoundError, AssertionError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 def _plot(rest: list[str]) -> None:

@@ -24,6 +24,7 @@ from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
 from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
+from sb3_dreamer_urlb.videos import VideoCallback
 from sb3_dreamer_urlb.zoo import resuming
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
@@ -148,11 +149,13 @@ def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwarg
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
-    """Tell the snapshots their folder, whose number rl_zoo3 chooses; keep the run, so that ``-i`` can go on with it."""
+    """Tell snapshots and films their folder, whose number rl_zoo3 chooses; keep the run, so that ``-i`` can go on with it."""
     original(manager)
     for callback in manager.callbacks:
         if isinstance(callback, RunSnapshotCallback):
             callback.save_path = str(Path(manager.save_path) / "snapshots")
+        if isinstance(callback, VideoCallback) and callback.folder is None:
+            callback.folder = Path(manager.save_path) / "videos"
     kept = any(isinstance(callback, RunCheckpointCallback) for callback in manager.callbacks)
     if manager.optimize_hyperparameters or manager.checkpoint_options is False or kept:
         return
