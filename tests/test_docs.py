@@ -223,5 +223,5 @@ def test_sharing(small_world, tmp_path):
     [block] = code_blocks("docs/hub.md")
     block = block.replace('"./shared/walker-run",', f'"./shared/walker-run", {TASK}, env_id="urlb/walker-run-v0",')
     names = run(block, {})
-    assert names["path"] == str(tmp_path / "shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
+    assert Path(names["path"]) == Path("shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
     assert names["model"].phase == "finetuning" and "python train.py" in (tmp_path / "shared/walker-run/README.md").read_text()

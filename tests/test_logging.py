@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger, configure
+from stable_baselines3.common.monitor import Monitor
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_dreamer_urlb import PhaseSwitchCallback, VideoCallback
@@ -147,7 +148,9 @@ def test_csv_json_and_tensorboard_hold_the_same_numbers(tiny_model, tmp_path):
 
 
 def test_evaluations_are_logged_as_sb3_does(tiny_model, tmp_path):
-    test = EvalCallback(CounterEnv(8, rewards=[1.0]), eval_freq=16, n_eval_episodes=2, verbose=0, log_path=str(tmp_path))
+    test = EvalCallback(
+        Monitor(CounterEnv(8, rewards=[1.0])), eval_freq=16, n_eval_episodes=2, verbose=0, log_path=str(tmp_path)
+    )
     _, recorder = recorded(tiny_model, 33, test, env=CounterEnv(8))
     evaluations = [dump for dump in recorder.dumps if "eval/mean_reward" in dump]
     assert [(dump["eval/mean_reward"], dump["eval/mean_ep_length"]) for dump in evaluations] == [(8.0, 8.0)] * 2

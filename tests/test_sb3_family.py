@@ -17,6 +17,12 @@ Where DreamerV2 deviates, and why:
   torch's global generator, as everywhere in SB3.
 - Float images must have their channels first (as in SB3, which transposes uint8 images only) and finite bounds.
 - MultiBinary actions are refused, with SB3's AssertionError.
+- A snapshot is always whole: ``save`` takes neither ``exclude`` nor ``include``; it holds no replay, as in SB3.
+- ``load`` refuses keywords that are no constructor arguments; SB3 sets any as an attribute.
+- ``num_timesteps`` may overshoot by less than ``train_freq`` steps, as in SB3's other off-policy algorithms.
+- A Dict with one vector is not the same network as that vector alone: its encoder stands behind a name.
+- The identity environments that SB3 learns as a check are not learnt here, as sequences and imagination cost too much. What is
+  learnt is checked by ``make test-slow`` and docs/results.md.
 - ``learning_starts`` counts steps of the phase, not of the call: a second ``learn`` does not warm up again.
 - Dict observations need ``MultiInputPolicy`` and images ``CnnPolicy`` or ``MlpPolicy`` (flattened), as in SB3.
 """

@@ -72,7 +72,8 @@ def encode(value: Any) -> Any:
     if type(value) is VectorizedActionNoise:
         return encode(value.base_noise)  # learn() makes one for each environment again
     for kind, encoder in ENCODERS.items():
-        if type(value) is kind:
+        # A space of the user's own class is, for everything that reads files, what it derives from.
+        if type(value) is kind or (isinstance(value, spaces.Space) and isinstance(value, kind)):
             tag, fields = encoder(value)
             return {TAG: tag, **{name: encode(field) for name, field in fields.items()}}
     return _encode_intrinsic(value)

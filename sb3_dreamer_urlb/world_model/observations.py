@@ -152,10 +152,13 @@ class Classes(Vectors):
 
     :param space: Discrete or MultiDiscrete
     :param normalize_images: unused, every kind of vector is made with it
+    :raises UnsupportedSpaceError: for MultiDiscrete of several dimensions, which SB3's ``predict`` does not take
     """
 
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         assert isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and space.shape is not None
+        if len(space.shape) > 1:
+            raise UnsupportedSpaceError(f"SB3 takes MultiDiscrete observations of one dimension only, got {space}.")
         self.shape = space.shape
         self.classes = classes_of(space)
         self.start = th.as_tensor(np.broadcast_to(space.start, self.shape).flatten().astype(np.int64))
