@@ -17,6 +17,14 @@ INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
         [("run_folder", "kill_at_random")],
         "the same bits as a run that was not killed",
     ),
+    "SIGKILL of rl_zoo3's command in both phases, gone on with by `-i`": (
+        [("zoo_resume", "kill_9")],
+        "the same bits, evaluations and episodes as a run that was not killed",
+    ),
+    'a script that crashes and is started again (`resume="auto"`), VecNormalize, a full replay on disk': (
+        [("resume", "the_same_script"), ("resume", "a_run_with_vecnormalize"), ("run_folder", "400_steps")],
+        "the same bits",
+    ),
     "SIGKILL at every write step of a checkpoint": (
         [("fault_injection", "kill_at_every")],
         "the old checkpoint or the new one, whole, with its replay",
@@ -64,6 +72,10 @@ INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
     "worker fails again and again, or cannot start": (
         [("supervisor", "repeated"), ("supervisor", "an_environment")],
         "one error names environment and step",
+    ),
+    "an environment is given up on in the middle of a run, or of an evaluation": (
+        [("resume", "a_run_that_an"), ("resume", "a_run_without"), ("resume", "an_environment_of")],
+        "a checkpoint or a snapshot first; one error names it",
     ),
     "close() with dead, hanging, stopped, busy workers": (
         [("supervisor", "close_returns"), ("supervisor", "a_process_ends")],
