@@ -63,7 +63,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         nargs="?",
         const=STDOUT,
         metavar="FILE",
-        help="write one JSON object there, too; without FILE print it instead",
+        help="write a JSON object there, too; without FILE print it instead",
     )
     options.add_argument("--quick", action=Quick, help="smallest networks, once: whether it runs, not how fast")
     return options
@@ -163,7 +163,7 @@ def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]
         "clock": options.clock,
         "python": platform.python_version(),
         **{package: found for package in PACKAGES if (found := _version(package))},
-        "preset": options.preset,
+        **({"preset": options.preset} if options.preset else {}),
     }
 
 
@@ -197,6 +197,7 @@ def report(
     options: argparse.Namespace,
     device: th.device,
     amounts: dict[str, dict[str, float]] | None = None,
+    notes: Sequence[str] = (),
     **more: object,
 ) -> None:
     """Print the table, ratios first, and write the JSON object, or print that. A ratio is best time over best time.
@@ -207,6 +208,7 @@ def report(
     :param options: of the command line
     :param device: that was measured
     :param amounts: row → unit → how much of it one time stands for: printed as a rate
+    :param notes: lines below the table
     :param more: for the JSON object only
     """
     about = machine(options, device)
@@ -216,7 +218,9 @@ def report(
         for row, units in (amounts or {}).items()
         if row in rows
     }
-    if write_json({"benchmark": name, **about, "ratios": ratios, "rates": rates, "seconds": rows, **more}, options):
+    if write_json(
+        {"benchmark": name, **about, "ratios": ratios, "rates": rates, "seconds": rows, "notes": list(notes), **more}, options
+    ):
         return
     print(f"{name}: {', '.join(f'{key} {value}' for key, value in about.items())}")
     width = max(map(len, rows))
@@ -229,6 +233,8 @@ def report(
         rate = "".join(f"  {value:.4g} {unit}" for unit, value in rates.get(row, {}).items())
         times = rows[row]
         print(f"  {ratio:>8}  {row:<{width}}  {min(times):8.4g} s, median {statistics.median(times):.4g}{rate}{compared}")
+    for note in notes:
+        print(f"  {note}")
 
 
 def write_json(result: dict[str, Any], options: argparse.Namespace) -> bool:

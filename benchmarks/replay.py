@@ -117,13 +117,13 @@ def main() -> None:
         keep_freed_memory()  # as a learner does
     episode = make_episode(min(EPISODE, options.rows // 3))
     work: dict[str, Callable[[], object]] = {}
-    floors, missing = {}, {}
+    floors, missing = {}, []
     with tempfile.TemporaryDirectory() as folder:
         for store in options.stores:
             try:
                 buffer = make_buffer(store, options, device, Path(folder))
             except (ValueError, RuntimeError, ModuleNotFoundError) as error:
-                missing[store] = f"not here: {error}"
+                missing.append(f"{store} does not work here: {error}")
                 continue
             work[f"sample, {store}"] = lambda buffer=buffer: buffer.sample(options.batch)
             work[f"add, {store}"] = fill(buffer, episode)
@@ -140,9 +140,7 @@ def main() -> None:
         else {"rows": added, "MB": added * size / MB}
         for row in work
     }
-    report("replay", times, floors, options, device, amounts, held=options.rows, row_bytes=size, missing=missing)
-    for store, why in missing.items():
-        print(f"  {store} {why}")
+    report("replay", times, floors, options, device, amounts, missing, held=options.rows, row_bytes=size)
 
 
 if __name__ == "__main__":
