@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2
 
@@ -122,6 +124,13 @@ def interleaved(
     return rows
 
 
+def tflop(work: Callable[[], object]) -> float:
+    """TFLOP of matrix products and convolutions that some work asks for, as torch counts them."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops() / 1e12
+
+
 class Product:
     """A big matrix product, 4096³: the arithmetic that a machine can do at best, in one format.
 
@@ -151,6 +160,13 @@ class Floor:
     row: str
     factor: float
     target: float | None = None
+
+
+def peak_rss() -> int:
+    """Bytes of memory that this process had at most. Linux: not ``resource.getrusage``, which begins with the parent's."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) * 1024
 
 
 def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]:

@@ -10,7 +10,6 @@ import argparse
 import importlib.util
 import json
 import platform
-import re
 import statistics
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch as th
-from common import seconds
+from common import peak_rss, seconds
 
 from sb3_dreamer_urlb.intrinsic.particles import knn_distances
 
@@ -83,10 +82,9 @@ def memory(device: th.device, reset: bool = False) -> int:
         if reset:
             th.cuda.reset_peak_memory_stats(device)
         return th.cuda.max_memory_allocated(device)
-    # Linux; not resource.getrusage, whose ru_maxrss begins with the parent's and keeps the peak of the imports
     if reset:
         Path("/proc/self/clear_refs").write_text("5")
-    return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
+    return peak_rss()
 
 
 def row(size: int, options: argparse.Namespace) -> dict[str, dict]:
