@@ -128,7 +128,7 @@ def tflop(work: Callable[[], object]) -> float:
     """TFLOP of matrix products and convolutions that some work asks for, as torch counts them."""
     with FlopCounterMode(display=False) as counter:
         work()
-    return counter.get_total_flops() / 1e12
+    return float(counter.get_total_flops()) / 1e12
 
 
 class Product:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,12 +56,12 @@ class Curves:
 
     def work(self, curve: str, point: int) -> Callable[[], object]:
         """A function that does what one point stands for."""
-        makers = {
+        makers: dict[str, Callable[[], Callable[[], object]]] = {
             "sequences a batch": lambda: self._update(self.explorer.learner, point),
             "imagination horizon": lambda: self._update(self._with_horizon(point), self.batch),
             "planner samples": lambda: self._plan(1, n_samples=point),
             "environments, planner": lambda: self._plan(point),
-            "environments, actor": lambda: lambda: self.explorer.predict(self.images[:point]),
+            "environments, actor": lambda: partial(self.explorer.predict, self.images[:point]),
         }
         return makers[curve]()
 

@@ -18,6 +18,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,8 @@ class Windows(BaseCallback):
             self.bare.reset()
             formats = {self.model.learner.dtype, th.bfloat16}
             self.products = {str(dtype): Product(dtype, self.model.device) for dtype in formats}
-        for name, work in {ENV: self.bare.step, **self.products}.items():
+        floors: dict[str, Callable[[], object]] = {ENV: self.bare.step, **self.products}
+        for name, work in floors.items():
             warm_up = 0 if name in self.floors else 1
             found = seconds(work, 1, self.model.device, self.options.clock, warm_up)
             self.floors.setdefault(name, []).extend(found)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import statistics
+from functools import partial
 
 from common import machine, make_model, parser, seconds, write_json
 from stable_baselines3.common.utils import get_device
 
-from sb3_dreamer_urlb.intrinsic import registered_intrinsic_rewards
+from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
 
 REFERENCE = "lbs"
 
@@ -23,7 +24,7 @@ def main() -> None:
             model = make_model(options, intrinsic_reward=name)
             model.learn(max(2 * model.batch_length, 200))
             batch = model.replay_buffer.sample(model.batch_size)
-            rows[name] += seconds(lambda model=model, batch=batch: model.learner.update(batch), 1, model.device, options.clock)
+            rows[name] += seconds(partial(model.learner.update, batch), 1, model.device, options.clock)
     median = {name: statistics.median(times) for name, times in rows.items()}
     about = machine(options, get_device(options.device))
     if write_json({"benchmark": "methods", **about, "seconds": rows}, options):

@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from common import peak_rss, seconds
@@ -44,15 +45,15 @@ def reward(distances: th.Tensor) -> th.Tensor:
 
 
 def ours(particles: th.Tensor, k: int) -> None:
-    reward(knn_distances(particles, k)).backward()
+    th.autograd.backward(reward(knn_distances(particles, k)))
 
 
 def cdist(particles: th.Tensor, k: int) -> None:
-    reward(th.cdist(particles, particles).topk(k, largest=False).values).backward()
+    th.autograd.backward(reward(th.cdist(particles, particles).topk(k, largest=False).values))
 
 
 def faiss(particles: th.Tensor, k: int) -> None:
-    import faiss
+    import faiss  # type: ignore[import-not-found]
 
     faiss.omp_set_num_threads(th.get_num_threads())
     points = particles.detach().numpy()
@@ -87,7 +88,7 @@ def memory(device: th.device, reset: bool = False) -> int:
     return peak_rss()
 
 
-def row(size: int, options: argparse.Namespace) -> dict[str, dict]:
+def row(size: int, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Every method that is installed and fits, each in a process."""
     skip = {"cdist"} if size > CDIST_LIMIT else set()
     if importlib.util.find_spec("faiss") is None or options.device != "cpu":
@@ -102,14 +103,14 @@ def row(size: int, options: argparse.Namespace) -> dict[str, dict]:
     return result
 
 
-def absolute(methods: dict[str, dict], name: str) -> str:
+def absolute(methods: dict[str, dict[str, Any]], name: str) -> str:
     """Median seconds and megabytes."""
     if name not in methods:
         return "-"
     return f"{statistics.median(methods[name]['seconds']):.3f} ({methods[name]['bytes'] / MB:.0f})"
 
 
-def ratio(methods: dict[str, dict], name: str) -> str:
+def ratio(methods: dict[str, dict[str, Any]], name: str) -> str:
     """How many times our seconds and our memory ``name`` takes."""
     if name not in methods:
         return "-"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def make_episode(steps: int) -> list[tuple[Any, ...]]:
 
 def make_buffer(store: str, options: argparse.Namespace, device: th.device, folder: Path) -> SequenceReplayBuffer:
     """An empty buffer with this store."""
-    kwargs = {"path": folder / store} if store in ON_DISK else {}
+    kwargs: dict[str, Any] = {"path": folder / store} if store in ON_DISK else {}
     return SequenceReplayBuffer(
         options.rows,
         spaces.Box(0, 255, (3, 64, 64), np.uint8),
@@ -125,7 +126,7 @@ def main() -> None:
             except (ValueError, RuntimeError, ModuleNotFoundError) as error:
                 missing.append(f"{store} does not work here: {error}")
                 continue
-            work[f"sample, {store}"] = lambda buffer=buffer: buffer.sample(options.batch)
+            work[f"sample, {store}"] = partial(buffer.sample, options.batch)
             work[f"add, {store}"] = fill(buffer, episode)
             floors[f"sample, {store}"], floors[f"add, {store}"] = Floor(GATHER, 1), Floor(COPY, 1)
         flat = Flat(buffer.columns(), options.rows, device)
