@@ -54,9 +54,12 @@ lint: setup  ## find faults, and code that 'make format' would change
 type: setup  ## check the types
 	$(BIN)/mypy
 
-bench: setup-gl  ## time the update and the planner (BENCH_ARGS)
-	$(BIN)/python benchmarks/update.py $(BENCH_ARGS)
-	$(BIN)/python benchmarks/planner.py $(BENCH_ARGS)
+bench: setup-gl  ## measure speed and memory on a CPU, ratios first, in under ten minutes (BENCH_ARGS)
+	$(BIN)/python benchmarks/update.py --repeat 1 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/planner.py --repeat 2 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/replay.py $(BENCH_ARGS)
+	$(BIN)/python benchmarks/collect.py --domains walker --environments 1 2 4 --repeat 2 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/end_to_end.py --repeat 1 $(BENCH_ARGS)
 
 golden: setup  ## compare with the official implementation's numbers (GOLDEN: files)
 	$(BIN)/python tests/golden.py $(GOLDEN)

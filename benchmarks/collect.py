@@ -17,6 +17,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -232,6 +233,40 @@ def sweep(rows: list[Row], options: argparse.Namespace, episode: int) -> dict[st
     return times
 
 
+def draw(times: dict[str, list[float]], path: Path) -> None:
+    """Frames a second over the number of environments, a panel a domain.
+
+    :param times: rows of the table
+    :param path: of the picture
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    # domain → (backend, kind) → n → frames a second
+    found: dict[str, dict[tuple[str, str], dict[int, float]]] = {}
+    for row, seconds in times.items():
+        domain, backend, what = row.split(", ")
+        n, kind = (1, BARE) if what == BARE else (int(what.split()[0]), what.split()[-1])
+        found.setdefault(domain, {}).setdefault((backend, kind), {})[n] = 1 / min(seconds)
+    figure, panels = pyplot.subplots(1, len(found), figsize=(3.4 * len(found), 3), layout="constrained", squeeze=False)
+    colours = dict(zip((*KINDS, BARE), ("tab:blue", "tab:orange", "tab:green", "grey"), strict=True))
+    styles = dict(zip(BACKENDS, ("-", "--"), strict=True))
+    for axes, (domain, lines) in zip(panels[0], found.items(), strict=True):
+        for (backend, kind), points in lines.items():
+            style = {"color": colours[kind], "linestyle": styles.get(backend, ":")}
+            if kind == BARE:
+                axes.axhline(points[1], linewidth=0.8, label=f"{kind}, {backend}", **style)
+            else:
+                axes.plot(sorted(points), [points[n] for n in sorted(points)], marker="o", label=f"{kind}, {backend}", **style)
+        axes.set(title=domain, xlabel="environments", ylim=(0, None), xticks=range(1, 1 + max(map(max, lines.values()))))
+        axes.grid(alpha=0.3)
+    panels[0, 0].set_ylabel("frames a second")
+    panels[0, -1].legend(fontsize=6)
+    figure.savefig(path, dpi=80)
+
+
 def main() -> None:
     """Sweep over domains and numbers of environments; backends and kinds take turns."""
     choice = parser(__doc__)
@@ -240,6 +275,7 @@ def main() -> None:
     choice.add_argument("--environments", nargs="+", type=int, default=[1, 2, 3, 4])
     choice.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     choice.add_argument("--seconds", type=float, default=0.4, help="of a window (default: 0.4)")
+    choice.add_argument("--picture", type=Path, metavar="FILE", help="draw the rates there; needs matplotlib")
     options = choice.parse_args()
     if options.quick:
         options.domains, options.environments, options.seconds = options.domains[:1], options.environments[:1], 0.0
@@ -264,6 +300,8 @@ def main() -> None:
     rendering = {name: os.environ.get(name) for name in ("LP_NUM_THREADS", "OMP_NUM_THREADS")}
     amounts = {row: {"frames": 1.0} for row in times}
     report("collect", times, floors, options, th.device("cpu"), amounts, missing, **rendering)
+    if options.picture:
+        draw(times, options.picture)
 
 
 if __name__ == "__main__":
