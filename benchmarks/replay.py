@@ -104,7 +104,7 @@ def fill(buffer: SequenceReplayBuffer, episode: list[tuple[Any, ...]]) -> Callab
 def main() -> None:
     """Time adding an episode to each store, and drawing a batch from it."""
     choice = parser(__doc__)
-    choice.add_argument("--stores", nargs="+", default=list(STORES), choices=STORES)
+    choice.add_argument("--stores", nargs="+", default=[store for store in STORES if store != "auto"], choices=STORES)
     choice.add_argument("--rows", type=int, default=20_000, help="that a store holds (default: 20 000, 246 MB)")
     choice.add_argument("--batch", type=int, default=50, help="sequences a batch (default: 50)")
     choice.add_argument("--length", type=int, default=50, help="rows a sequence (default: 50)")

@@ -86,7 +86,7 @@ def test_update_has_its_floor_at_paper_size(run, load, monkeypatch):
 def test_every_store_is_measured_and_its_floor_moves_the_same_bytes(run, load):
     replay = load("replay")
     _, result = run("replay")
-    for store in replay.STORES:
+    for store in set(replay.STORES) - {"auto"}:
         assert f"sample, {store}" in result["ratios"] or any(note.startswith(f"{store} ") for note in result["notes"])
     assert {"sample, memory", "add, memory", "sample, lmdb", "add, lmdb"} <= result["ratios"].keys()
     rates, seconds = result["rates"]["sample, memory"], min(result["seconds"]["sample, memory"])
