@@ -48,6 +48,8 @@ class Curves:
         self.explorer = make_model(options, precision=self.precision, intrinsic_reward="lbs")
         self.explorer.learn(max(2 * self.explorer.batch_length, 200))  # two finished episodes; no update yet
         self.planner = self._planning(options)
+        # Points replace the policy's.
+        self.own_planner: Any = self.planner.policy.planner
         self.images = np.random.default_rng(0).integers(0, 256, (max(POINTS["environments, actor"]), 64, 64, 3), np.uint8)
 
     def _planning(self, options: argparse.Namespace) -> DreamerV2:
@@ -80,8 +82,7 @@ class Curves:
         return lambda: learner.update(batch)
 
     def _plan(self, environments: int, **changes: Any) -> Callable[[], object]:
-        policy = self.planner.policy
-        own: Any = policy.planner
+        policy, own = self.planner.policy, self.own_planner
         changed = type(own)(dataclasses.replace(own.config, **changes), own.gae_lambda)
 
         def plan() -> None:

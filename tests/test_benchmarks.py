@@ -109,6 +109,17 @@ def test_the_floor_of_adding_keeps_every_row(load):
     assert flat.columns["reward"].tolist() == [14, 15, 12, 13]
 
 
+def test_points_of_a_curve_do_not_change_those_of_another(load):
+    curves = load("curves")
+    options = load("common").parser("").parse_args(["--quick", "--precision", "float32"])
+    own = curves.Curves(options)
+    samples = own.planner.policy.planner.config.n_samples
+    own.work("planner samples", 2 * samples)()
+    assert own.planner.policy.planner.config.n_samples == 2 * samples
+    own.work("environments, planner", 2)()
+    assert own.planner.policy.planner.config.n_samples == samples
+
+
 def test_methods(run, load, monkeypatch):
     monkeypatch.setattr(load("methods"), "registered_intrinsic_rewards", lambda: dict.fromkeys(("icm", "lbs")))
     _, result = run("methods", "--precision", "float32")
