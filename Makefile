@@ -54,13 +54,16 @@ lint: setup  ## find faults, and code that 'make format' would change
 type: setup  ## check the types
 	$(BIN)/mypy
 
-# Not --quiet: it would hide the warnings from --strict. The variable silences an advertisement of the theme's maker, which is no warning of ours.
+# Not --quiet: it would hide the warnings from --strict. The variable silences an advertisement of the theme's maker.
 docs: setup  ## build the documentation into site/; any warning fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-bench: setup-gl  ## time the update and the planner (BENCH_ARGS)
-	$(BIN)/python benchmarks/update.py $(BENCH_ARGS)
-	$(BIN)/python benchmarks/planner.py $(BENCH_ARGS)
+bench: setup-gl  ## measure speed and memory on a CPU, ratios first, in under ten minutes (BENCH_ARGS)
+	$(BIN)/python benchmarks/update.py --repeat 1 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/planner.py --repeat 2 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/replay.py $(BENCH_ARGS)
+	$(BIN)/python benchmarks/collect.py --domains walker --environments 1 2 4 --repeat 2 $(BENCH_ARGS)
+	$(BIN)/python benchmarks/end_to_end.py --repeat 1 $(BENCH_ARGS)
 
 golden: setup  ## compare with the official implementation's numbers (GOLDEN: files)
 	$(BIN)/python tests/golden.py $(GOLDEN)

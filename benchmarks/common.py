@@ -4,34 +4,39 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
+import re
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2
 
 
-class NoiseImages(gymnasium.Env):
+class NoiseImages(gymnasium.Env[np.ndarray, np.ndarray]):
     """Walker-sized images of noise: what is timed does not depend on their content."""
 
     observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
     action_space = spaces.Box(-1, 1, (6,), np.float32)
     never_terminates = True
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self.steps = 0
         return self._image(), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.steps += 1
         return self._image(), 0.5, False, self.steps == 100, {}
 
@@ -44,7 +49,9 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--preset", default="paper", help="size of the model (default: paper)")
     options.add_argument("--precision", nargs="+", default=["float32", "bfloat16"], help="formats of products to compare")
-    options.add_argument("--repeat", type=int, default=3, help="timed repetitions, after one that is not (default: 3)")
+    options.add_argument(
+        "--repeat", type=int, default=3, help="timed repetitions, after one that is not (default: %(default)s)"
+    )
     options.add_argument("--threads", type=int, help="of torch (default: as many as torch takes)")
     options.add_argument(
         "--clock",
@@ -53,18 +60,44 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         help="cpu counts this process's CPU time: for one thread on a machine that others use, too",
     )
     options.add_argument("--device", default="auto")
-    options.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    options.add_argument(
+        "--json",
+        nargs="?",
+        const=STDOUT,
+        metavar="FILE",
+        help="write a JSON object there, too; without FILE print it instead",
+    )
+    options.add_argument("--quick", action=Quick, help="smallest networks, once: whether it runs, not how fast")
     return options
+
+
+#: of ``--json``
+STDOUT = "-"
+
+
+class Quick(argparse.Action):
+    """``--quick``: what makes every benchmark a matter of seconds; options after it win."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **kwargs: Any):
+        super().__init__(option_strings, dest, nargs=0, default=False, **kwargs)
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: object) -> None:
+        namespace.quick, namespace.preset, namespace.repeat = True, "tiny", 1
 
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
-def make_model(options: argparse.Namespace, **kwargs: object) -> DreamerV2:
+def make_model(options: argparse.Namespace, **kwargs: Any) -> DreamerV2:
     """A fresh model on noise images."""
+    set_threads(options)
+    return DreamerV2("CnnPolicy", NoiseImages(), preset=options.preset, device=options.device, seed=0, **kwargs)
+
+
+def set_threads(options: argparse.Namespace) -> None:
+    """As many as ``--threads`` asks for, if it does."""
     if getattr(options, "threads", None):
         th.set_num_threads(options.threads)
-    return DreamerV2("CnnPolicy", NoiseImages(), preset=options.preset, device=options.device, seed=0, **kwargs)
 
 
 def seconds(work: Callable[[], object], repeat: int, device: th.device, clock: str = "wall", warm_up: int = 1) -> list[float]:
@@ -89,6 +122,13 @@ def interleaved(
             times = seconds(part, 1, device, options.clock, warm_up=0)
             rows[name] += times if turn else []
     return rows
+
+
+def tflop(work: Callable[[], object]) -> float:
+    """TFLOP of matrix products and convolutions that some work asks for, as torch counts them."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return float(counter.get_total_flops()) / 1e12
 
 
 class Product:
@@ -122,16 +162,36 @@ class Floor:
     target: float | None = None
 
 
+def peak_rss() -> int:
+    """Bytes of memory that this process had at most. Linux: not ``resource.getrusage``, which begins with the parent's."""
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert found is not None
+    return int(found[1]) * 1024
+
+
 def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]:
     """Where and how something was timed."""
     return {
         "device": th.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
+        "cores": os.cpu_count(),
+        "load": round(os.getloadavg()[0], 1),
         "threads": th.get_num_threads(),
         "clock": options.clock,
-        "torch": th.__version__,
         "python": platform.python_version(),
-        "preset": options.preset,
+        **{package: found for package in PACKAGES if (found := _version(package))},
+        **({"preset": options.preset} if options.preset else {}),
     }
+
+
+#: whose versions matter for speed
+PACKAGES = ("torch", "numpy", "stable-baselines3", "mujoco", "dm-control", "sb3_dreamer_urlb")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def _cpu_name() -> str:
@@ -147,20 +207,36 @@ def _cpu_name() -> str:
 
 
 def report(
-    name: str, rows: dict[str, list[float]], floors: dict[str, Floor], options: argparse.Namespace, device: th.device
+    name: str,
+    rows: dict[str, list[float]],
+    floors: dict[str, Floor],
+    options: argparse.Namespace,
+    device: th.device,
+    amounts: dict[str, dict[str, float]] | None = None,
+    notes: Sequence[str] = (),
+    **more: object,
 ) -> None:
-    """Print the table, ratios first, or the JSON object. A ratio is best time over best time.
+    """Print the table, ratios first, and write the JSON object, or print that. A ratio is best time over best time.
 
     :param name: of the benchmark
     :param rows: times of everything measured, the floors' rows included
     :param floors: what rows are compared with
     :param options: of the command line
     :param device: that was measured
+    :param amounts: row → unit → how much of it one time stands for: printed as a rate
+    :param notes: lines below the table
+    :param more: for the JSON object only
     """
     about = machine(options, device)
     ratios = {row: min(rows[row]) / (floor.factor * min(rows[floor.row])) for row, floor in floors.items() if row in rows}
-    if options.json:
-        print(json.dumps({"benchmark": name, **about, "ratios": ratios, "seconds": rows}))
+    rates = {
+        row: {f"{unit}/s": amount / min(rows[row]) for unit, amount in units.items()}
+        for row, units in (amounts or {}).items()
+        if row in rows
+    }
+    if write_json(
+        {"benchmark": name, **about, "ratios": ratios, "rates": rates, "seconds": rows, "notes": list(notes), **more}, options
+    ):
         return
     print(f"{name}: {', '.join(f'{key} {value}' for key, value in about.items())}")
     width = max(map(len, rows))
@@ -170,5 +246,22 @@ def report(
             ratio, floor = f"{ratios[row]:.2f} ×", floors[row]
             target = "" if floor.target is None else f", target {floor.target:g}"
             compared = f"  ({floor.factor:.4g} × {floor.row}{target})"
+        rate = "".join(f"  {value:.4g} {unit}" for unit, value in rates.get(row, {}).items())
         times = rows[row]
-        print(f"  {ratio:>8}  {row:<{width}}  {min(times):8.4f} s, median {statistics.median(times):.4f}{compared}")
+        print(f"  {ratio:>8}  {row:<{width}}  {min(times):8.4g} s, median {statistics.median(times):.4g}{rate}{compared}")
+    for note in notes:
+        print(f"  {note}")
+
+
+def write_json(result: dict[str, Any], options: argparse.Namespace) -> bool:
+    """To the file that ``--json`` names.
+
+    :param result: what was measured
+    :param options: of the command line
+    :return: whether it was printed, in place of the table
+    """
+    if options.json == STDOUT:
+        print(json.dumps(result))
+    elif options.json:
+        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
+    return bool(options.json == STDOUT)

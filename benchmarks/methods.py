@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import statistics
+from functools import partial
 
-import torch as th
-from common import make_model, parser, seconds
+from common import machine, make_model, parser, seconds, write_json
+from stable_baselines3.common.utils import get_device
 
-from sb3_dreamer_urlb.intrinsic import registered_intrinsic_rewards
+from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
 
 REFERENCE = "lbs"
 
@@ -24,12 +24,12 @@ def main() -> None:
             model = make_model(options, intrinsic_reward=name)
             model.learn(max(2 * model.batch_length, 200))
             batch = model.replay_buffer.sample(model.batch_size)
-            rows[name] += seconds(lambda model=model, batch=batch: model.learner.update(batch), 1, model.device, options.clock)
+            rows[name] += seconds(partial(model.learner.update, batch), 1, model.device, options.clock)
     median = {name: statistics.median(times) for name, times in rows.items()}
-    if options.json:
-        print(json.dumps({"benchmark": "methods", "preset": options.preset, "threads": th.get_num_threads(), "seconds": rows}))
+    about = machine(options, get_device(options.device))
+    if write_json({"benchmark": "methods", **about, "seconds": rows}, options):
         return
-    print(f"{options.preset}, {th.get_num_threads()} threads, torch {th.__version__}")
+    print(f"methods: {', '.join(f'{key} {value}' for key, value in about.items())}")
     print(f"{'method':<14}{'÷ lbs':>7}{'seconds':>10}")
     for name in sorted(names, key=lambda name: median[name]):
         print(f"{name:<14}{median[name] / median[REFERENCE]:>7.2f}{median[name]:>10.3f}")

@@ -10,15 +10,15 @@ import argparse
 import importlib.util
 import json
 import platform
-import re
 import statistics
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch as th
-from common import seconds
+from common import peak_rss, seconds
 
 from sb3_dreamer_urlb.intrinsic.particles import knn_distances
 
@@ -45,15 +45,15 @@ def reward(distances: th.Tensor) -> th.Tensor:
 
 
 def ours(particles: th.Tensor, k: int) -> None:
-    reward(knn_distances(particles, k)).backward()
+    th.autograd.backward(reward(knn_distances(particles, k)))
 
 
 def cdist(particles: th.Tensor, k: int) -> None:
-    reward(th.cdist(particles, particles).topk(k, largest=False).values).backward()
+    th.autograd.backward(reward(th.cdist(particles, particles).topk(k, largest=False).values))
 
 
 def faiss(particles: th.Tensor, k: int) -> None:
-    import faiss
+    import faiss  # type: ignore[import-not-found]
 
     faiss.omp_set_num_threads(th.get_num_threads())
     points = particles.detach().numpy()
@@ -83,13 +83,12 @@ def memory(device: th.device, reset: bool = False) -> int:
         if reset:
             th.cuda.reset_peak_memory_stats(device)
         return th.cuda.max_memory_allocated(device)
-    # Linux; not resource.getrusage, whose ru_maxrss begins with the parent's and keeps the peak of the imports
     if reset:
         Path("/proc/self/clear_refs").write_text("5")
-    return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
+    return peak_rss()
 
 
-def row(size: int, options: argparse.Namespace) -> dict[str, dict]:
+def row(size: int, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Every method that is installed and fits, each in a process."""
     skip = {"cdist"} if size > CDIST_LIMIT else set()
     if importlib.util.find_spec("faiss") is None or options.device != "cpu":
@@ -104,14 +103,14 @@ def row(size: int, options: argparse.Namespace) -> dict[str, dict]:
     return result
 
 
-def absolute(methods: dict[str, dict], name: str) -> str:
+def absolute(methods: dict[str, dict[str, Any]], name: str) -> str:
     """Median seconds and megabytes."""
     if name not in methods:
         return "-"
     return f"{statistics.median(methods[name]['seconds']):.3f} ({methods[name]['bytes'] / MB:.0f})"
 
 
-def ratio(methods: dict[str, dict], name: str) -> str:
+def ratio(methods: dict[str, dict[str, Any]], name: str) -> str:
     """How many times our seconds and our memory ``name`` takes."""
     if name not in methods:
         return "-"

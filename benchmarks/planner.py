@@ -7,6 +7,7 @@ environments is one environment.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch as th
@@ -25,8 +26,8 @@ def main() -> None:
     for precision in options.precision:
         model = make_model(options, precision=precision, planner="dyna_mpc", learning_starts=0, planner_delay=0)
         one, ten = (f"Dyna-MPC, {environments}, {precision}" for environments in ("1 environment", "10 environments"))
-        work[one] = lambda model=model: model.predict(images[:1])
-        work[ten] = lambda model=model: model.predict(images)
+        work[one] = partial(model.predict, images[:1])
+        work[ten] = partial(model.predict, images)
         if options.preset == "paper":
             floors[one] = Floor(PRODUCT, TFLOP / Product.TFLOP, 1.0)
         floors[ten] = Floor(one, 1.0, 8.0)

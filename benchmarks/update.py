@@ -6,6 +6,7 @@ The floor is the time that the authors' arithmetic of an update, 2.4 TFLOP, take
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report
@@ -35,10 +36,10 @@ def parts(learner: Learner, batch: SequenceBatch) -> dict[str, Callable[[], obje
 
 def main() -> None:
     """Time a pre-training update (LBS) and a fine-tuning update in each format."""
-    options = parser(__doc__)
-    options.add_argument("--phases", nargs="+", default=["pre-training (LBS)", "fine-tuning"], choices=PHASES)
-    options.add_argument("--parts", action="store_true", help="time the world model's and the behaviour's half, too")
-    options = options.parse_args()
+    choice = parser(__doc__)
+    choice.add_argument("--phases", nargs="+", default=["pre-training (LBS)", "fine-tuning"], choices=PHASES)
+    choice.add_argument("--parts", action="store_true", help="time the world model's and the behaviour's half, too")
+    options = choice.parse_args()
     work: dict[str, Callable[[], object]] = {}
     floors = {}
     for precision in options.precision:
@@ -47,7 +48,7 @@ def main() -> None:
             model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
             learner, batch = model.learner, model.replay_buffer.sample(model.batch_size)
             row = f"{phase}, {precision}"
-            work[row] = lambda learner=learner, batch=batch: learner.update(batch)
+            work[row] = partial(learner.update, batch)
             if options.parts:
                 work.update({f"{row}, {part}": half for part, half in parts(learner, batch).items()})
             product = f"product of 4096³ in {str(learner.dtype).removeprefix('torch.')}"
