@@ -13,7 +13,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 #: numbers in a piece; fewer than ``SMALLEST`` are not worth the calls
-PIECE = {th.float32: 2**17, th.bfloat16: 2**17}
+PIECE = {th.float32: 2**17, th.bfloat16: 2**18}
 SMALLEST = 2**14
 
 

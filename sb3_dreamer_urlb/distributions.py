@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
@@ -25,10 +26,23 @@ def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.
     :param generator: source of randomness, the global one if None
     :return: class indices, int64 (…)
     """
+    if probs.device.type == "cpu" and probs.dim() > 1 and len(probs) > 1 and probs.movedim(0, -1).is_contiguous():
+        return _draw_by_counting(probs, generator)
     cdf = probs.cumsum(-1)
     uniform = th.rand(cdf.shape[:-1] + (1,), generator=generator, device=cdf.device, dtype=cdf.dtype)
     # Rounding can make the product the whole sum, hence the bound.
     return th.searchsorted(cdf, uniform * cdf[..., -1:], right=True).squeeze(-1).clamp_(max=cdf.shape[-1] - 1)
+
+
+def _draw_by_counting(probs: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+    """:func:`draw_classes` where the first dimension is innermost in memory: operations take one class of all rows at once."""
+    cdf = probs.movedim(0, -1).clone()  # (…, K, n)
+    by_class = cdf.unbind(-2)
+    for below, this in pairwise(by_class):
+        this.add_(below)
+    bound = th.empty_like(by_class[-1]).uniform_(generator=generator).mul_(by_class[-1])
+    # In place a comparison gives numbers, which are faster to count than booleans.
+    return cdf.le_(bound.unsqueeze(-2)).sum(-2).clamp_(max=len(by_class) - 1).movedim(-1, 0).long()
 
 
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:

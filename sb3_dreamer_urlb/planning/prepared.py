@@ -1,0 +1,218 @@
+"""An agent's networks made ready for planning on a CPU: the same model with less arithmetic and fewer passes over memory.
+
+A sampled state is S ones among S · K numbers. A product with it is the sum of S rows of the weights, so states keep the ones'
+places and no layer ever reads the other numbers. Everything between two draws stays small enough for the processor's cache:
+one step of the trajectories is scored before the next. Weights are brought into the products' format once a plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.agent import Agent, PlannedAgent
+from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.types import LatentState
+from sb3_dreamer_urlb.world_model.rssm import RSSM
+
+#: of a logit above its variable's mean, so that exp stays finite; another class this far above would be drawn as often
+MAX_LOGIT = 80.0
+#: variables drawn at once
+BLOCK = 8
+
+
+@dataclass
+class SampledState:
+    """z as the places of its ones.
+
+    :param classes: int64 (n, S), counted through all S · K numbers
+    :param deter: float (n, D)
+    :param short: ``deter`` in the format of products
+    :param stoch_size: S · K
+    """
+
+    classes: th.Tensor
+    deter: th.Tensor
+    short: th.Tensor
+    stoch_size: int
+
+    @property
+    def feature(self) -> th.Tensor:
+        """[stochastic, deterministic], float (n, F)."""
+        stoch = self.deter.new_zeros(len(self.deter), self.stoch_size).scatter_(1, self.classes, 1.0)
+        return th.cat([stoch, self.deter], -1)
+
+
+class PreparedAgent(PlannedAgent):
+    """:class:`~sb3_dreamer_urlb.agent.PlannedAgent` for one plan on a CPU. What its heads read are states, not features.
+
+    :param agent: the networks
+    :param skill: that each of the n environments follows, float (n, W); W is 0 without skills
+    :param dtype: of products
+    """
+
+    def __init__(self, agent: Agent, skill: th.Tensor, dtype: th.dtype):
+        super().__init__(agent, skill)
+        model = agent.world_model
+        variables, classes = model.rssm.logits_shape
+
+        def head(mlp: MLP) -> _Head:
+            return _Head(mlp, variables, classes, dtype)
+
+        self._dynamics = _Dynamics(model.rssm, dtype)
+        self._reward, self._value = head(model.reward), head(agent.slow_critic)
+        self._discount = None if model.discount_logit is None else head(model.discount_logit)
+
+    def step(  # type: ignore[override]
+        self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None
+    ) -> SampledState:
+        with th.autocast("cpu", enabled=False):
+            return self._dynamics.step(state, action, generator)
+
+    def features(self, states: Sequence[SampledState]) -> Sequence[SampledState]:  # type: ignore[override]
+        return states
+
+    def rewards(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
+        return self._ask(self._reward, feature).squeeze(-1)
+
+    def values(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
+        if self.skill is None:
+            return self._ask(self._value, feature).squeeze(-1)
+        skill = self._skill_of(feature[0].deter)
+        value = self._ask(self._value, feature, skill)
+        # Successor features have one output for each number of the skill.
+        return value.squeeze(-1) if value.shape[-1] == 1 else (value * skill).sum(-1)
+
+    def discounts(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
+        gamma = self.agent.world_model.gamma
+        if self._discount is None:
+            return feature[0].deter.new_full((len(feature), len(feature[0].deter)), gamma)
+        return gamma * th.sigmoid(self._ask(self._discount, feature).squeeze(-1))
+
+    @staticmethod
+    def _ask(head: _Head, states: Sequence[SampledState], skill: th.Tensor | None = None) -> th.Tensor:
+        with th.autocast("cpu", enabled=False):
+            return th.stack([head(state, skill) for state in states])
+
+
+class _Head:
+    """An MLP that reads sampled states.
+
+    :param mlp: the network
+    :param variables: S
+    :param classes: K
+    :param dtype: of products
+    """
+
+    def __init__(self, mlp: MLP, variables: int, classes: int, dtype: th.dtype):
+        first, *others = [*mlp.dense, mlp.out]
+        stoch_size = variables * classes
+        # Each state is the sum of S rows: an S-th of the bias in each.
+        rows = first.weight[:, :stoch_size].T + first.bias / variables
+        self.rows, self.rest = rows.to(dtype).contiguous(), first.weight[:, stoch_size:].to(dtype)
+        self.layers = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in others]
+
+    def __call__(self, state: SampledState, skill: th.Tensor | None) -> th.Tensor:
+        """→ float (n, outputs)."""
+        rest = state.short if skill is None else th.cat([state.short, skill.to(state.short.dtype)], -1)
+        x = th.addmm(F.embedding_bag(state.classes, self.rows, mode="sum"), rest, self.rest.T)
+        for weight, bias in self.layers:
+            x = F.linear(elu(x), weight, bias)
+        return full(x)
+
+
+class _Dynamics:
+    """The RSSM's prior step.
+
+    :param rssm: the network
+    :param dtype: of products
+    """
+
+    def __init__(self, rssm: RSSM, dtype: th.dtype):
+        self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
+        self.rows = rssm.stoch_rows().to(dtype)
+        self.action = rssm.input.weight[:, rssm.stoch_size :].to(dtype)
+        self.gru, self.norm = _in_order_of_use(rssm, dtype)
+        self.hidden = _short(rssm.prior_hidden, dtype)
+        # A constant for each variable changes no probability: logits whose mean is 0 need no search for their largest.
+        weight = rssm.prior_logits.weight.view(*self.shape, -1)
+        bias = rssm.prior_logits.bias.view(self.shape)
+        self.logits_weight = (weight - weight.mean(1, keepdim=True)).to(dtype)
+        self.logits_bias = (bias - bias.mean(1, keepdim=True)).unsqueeze(-1)
+        self.input_bias = rssm.input.bias.to(dtype)
+        self.first_class = th.arange(0, rssm.stoch_size, self.shape[1])
+        self._start: LatentState | None = None
+
+    def step(
+        self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None
+    ) -> SampledState:
+        if isinstance(state, LatentState):
+            stoch_part, short = self._start_part(state), state.deter.to(self.dtype)
+        else:
+            stoch_part, short = F.embedding_bag(state.classes, self.rows, mode="sum"), state.short
+        x = elu(F.linear(action.to(self.dtype), self.action, self.input_bias).add_(stoch_part))
+        deter = self._recur(th.cat([x, short], -1), state.deter)
+        short = deter.to(self.dtype)
+        return SampledState(self._draw(short, generator), deter, short, self.stoch_size)
+
+    def _start_part(self, state: LatentState) -> th.Tensor:
+        """Computed once: each iteration of a plan begins with the same states."""
+        if self._start is not state:
+            self._start, self._part = state, state.stoch.to(self.dtype) @ self.rows
+        return self._part
+
+    def _recur(self, inputs: th.Tensor, deter: th.Tensor) -> th.Tensor:
+        parts = F.layer_norm(full(F.linear(inputs, *self.gru)), self.norm[0].shape, *self.norm)
+        size = deter.shape[-1]
+        reset, update = parts[:, : 2 * size].sigmoid().chunk(2, -1)
+        return th.lerp(deter, reset.mul(parts[:, 2 * size :]).tanh_(), update)
+
+    def _draw(self, short: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        hidden = elu(F.linear(short, *self.hidden)).T
+        parts = zip(self.logits_weight.split(BLOCK), self.logits_bias.split(BLOCK), strict=True)
+        drawn = [self._draw_block(hidden, weight, bias, generator) for weight, bias in parts]
+        return th.cat(drawn, 1).add_(self.first_class)
+
+    @staticmethod
+    def _draw_block(
+        hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, generator: th.Generator | None
+    ) -> th.Tensor:
+        """Some variables. Classes lie outermost in memory: what is done for each class runs over all states at once."""
+        logits = (weight.flatten(0, 1) @ hidden).view(*weight.shape[:2], -1).float()  # (variables, K, n)
+        probs = logits.add_(bias).clamp_(max=MAX_LOGIT).exp_().movedim(-1, 0)
+        return distributions.draw_classes(probs, generator)
+
+
+def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[tuple[th.Tensor, th.Tensor], tuple[th.Tensor, th.Tensor]]:
+    """The GRU's layer and its norm with the parts (reset, update, candidate), and the bias of the update gate within."""
+
+    def ordered(parameter: th.Tensor) -> th.Tensor:
+        reset, candidate, update = parameter.chunk(3)
+        return th.cat([reset, update, candidate])
+
+    norm_bias = ordered(rssm.gru_norm.bias)
+    norm_bias[rssm.deter_size : 2 * rssm.deter_size] -= 1
+    gru = ordered(rssm.gru.weight).to(dtype), ordered(rssm.gru.bias).to(dtype)
+    return gru, (ordered(rssm.gru_norm.weight), norm_bias)
+
+
+def _short(layer: nn.Linear, dtype: th.dtype) -> tuple[th.Tensor, th.Tensor]:
+    return layer.weight.to(dtype), layer.bias.to(dtype)
+
+
+def planned(agent: Agent, skill: th.Tensor) -> PlannedAgent:
+    """The agent as a planner sees it, in the form for its device. Products run in the format that autocast asks for now.
+
+    :param agent: the networks
+    :param skill: that each of the n environments follows, float (n, W); W is 0 without skills
+    """
+    if skill.device.type != "cpu":
+        return PlannedAgent(agent, skill)
+    return PreparedAgent(agent, skill, th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else th.float32)
