@@ -12,9 +12,11 @@ import torch.nn.functional as F
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-#: numbers in a piece; fewer than ``SMALLEST`` are not worth the calls
-PIECE = {th.float32: 2**17, th.bfloat16: 2**18}
+FORMATS = (th.float32, th.bfloat16)
+#: numbers that are not worth the calls
 SMALLEST = 2**14
+#: numbers that are done at once, and numbers in a piece of more
+WHOLE, PIECE = 2**18, 2**16
 
 
 def elu(x: th.Tensor) -> th.Tensor:
@@ -22,7 +24,7 @@ def elu(x: th.Tensor) -> th.Tensor:
 
     :param x: float tensor of any shape; never changed
     """
-    if x.device.type != "cpu" or x.dtype not in PIECE or x.numel() < SMALLEST or not _is_dense(x):
+    if x.device.type != "cpu" or x.dtype not in FORMATS or x.numel() < SMALLEST or not _is_dense(x):
         return F.elu(x)
     return _ELU.apply(x) if th.is_grad_enabled() and x.requires_grad else _in_pieces(x)
 
@@ -51,7 +53,8 @@ def _in_pieces(x: th.Tensor) -> th.Tensor:
     # Both in the order of memory.
     source, target = (t.as_strided((t.numel(),), (1,)) for t in (x, y))
     compute = _short if x.dtype == th.bfloat16 else _full
-    for piece, out in zip(source.split(PIECE[x.dtype]), target.split(PIECE[x.dtype]), strict=True):
+    piece_size = PIECE if x.numel() > WHOLE else WHOLE
+    for piece, out in zip(source.split(piece_size), target.split(piece_size), strict=True):
         compute(piece, out)
     return y
 

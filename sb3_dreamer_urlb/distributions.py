@@ -12,6 +12,8 @@ from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 ACTION_MARGIN = 1e-6
@@ -64,9 +66,19 @@ def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> 
     """
     probs = logits.softmax(-1)
     one_hot = one_hot_like(probs, draw_classes(probs.detach(), generator))
-    if not probs.requires_grad:
-        return one_hot
-    return one_hot + (probs - probs.detach())
+    return _StraightThrough.apply(one_hot, probs) if probs.requires_grad else one_hot
+
+
+class _StraightThrough(Function):
+    """The first argument, with the gradient of the second."""
+
+    @staticmethod
+    def forward(ctx: th.autograd.function.FunctionCtx, value: th.Tensor, slope: th.Tensor) -> th.Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[None, th.Tensor]:
+        return None, grad
 
 
 def one_hot_like(probs: th.Tensor, classes: th.Tensor) -> th.Tensor:
@@ -92,7 +104,7 @@ def unit_normal_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
 
 
 def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
-    """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images, in one pass over the pixels.
+    """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images.
 
     :param mean: float (…, C, height, width)
     :param target: same shape
@@ -100,7 +112,23 @@ def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
     """
     pixels = mean.shape[-3:].numel()
     images = mean.numel() // pixels
-    return 0.5 * F.mse_loss(mean, target, reduction="sum") / images + pixels * HALF_LOG_2PI
+    return _SquaredDistance.apply(mean, target) / (2 * images) + pixels * HALF_LOG_2PI
+
+
+class _SquaredDistance(Function):
+    """Of all images together. torch's own loss hands its gradient on in another memory layout than the images have."""
+
+    @staticmethod
+    def forward(ctx: th.autograd.function.FunctionCtx, mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+        difference = mean - target
+        ctx.save_for_backward(difference)
+        return th.linalg.vector_norm(difference, dim=(-3, -2, -1)).square().sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
+        (difference,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return difference * (2 * grad), None
 
 
 class BoundedNormal:

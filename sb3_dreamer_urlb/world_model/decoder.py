@@ -71,8 +71,9 @@ class ConvDecoder(nn.Module):
         first = self.deconvs[0]
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
-        y = (x @ first.weight.view(channels, -1)).view(-1, out, height, width)
-        return y + first.bias.to(y.dtype).view(1, -1, 1, 1)
+        # Channels last, as all that follow.
+        y = (x @ first.weight.permute(0, 2, 3, 1).reshape(channels, -1)).view(-1, height, width, out)
+        return (y + first.bias.to(y.dtype)).permute(0, 3, 1, 2)
 
 
 class VectorDecoder(MLP):
