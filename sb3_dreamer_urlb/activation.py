@@ -24,15 +24,22 @@ def elu(x: th.Tensor) -> th.Tensor:
 
     :param x: float tensor of any shape; never changed
     """
-    if x.device.type != "cpu" or x.dtype not in FORMATS or x.numel() < SMALLEST or not _is_dense(x):
+    if not _cheaper(x):
         return F.elu(x)
-    return _ELU.apply(x) if th.is_grad_enabled() and x.requires_grad else _in_pieces(x)
+    return _ELU.apply(x) if th.is_grad_enabled() and x.requires_grad else _in_pieces(x, th.empty_like(x))
+
+
+def elu_(x: th.Tensor) -> th.Tensor:
+    """:func:`elu` that overwrites its input; without gradients."""
+    if not _cheaper(x):
+        return F.elu_(x)
+    return _in_pieces(x, x)
 
 
 class _ELU(Function):
     @staticmethod
     def forward(ctx: th.autograd.function.FunctionCtx, x: th.Tensor) -> th.Tensor:
-        y = _in_pieces(x)
+        y = _in_pieces(x, th.empty_like(x))
         ctx.save_for_backward(y)
         return y
 
@@ -43,13 +50,14 @@ class _ELU(Function):
         return th.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, y)
 
 
-def _is_dense(x: th.Tensor) -> bool:
-    """Whether the numbers lie in memory one after the other, in whatever order."""
+def _cheaper(x: th.Tensor) -> bool:
+    """Whether to compute it here. The numbers must lie in memory one after the other, in whatever order."""
+    if x.device.type != "cpu" or x.dtype not in FORMATS or x.numel() < SMALLEST:
+        return False
     return x.is_contiguous() or (x.dim() == 4 and x.is_contiguous(memory_format=th.channels_last))
 
 
-def _in_pieces(x: th.Tensor) -> th.Tensor:
-    y = th.empty_like(x)
+def _in_pieces(x: th.Tensor, y: th.Tensor) -> th.Tensor:
     # Both in the order of memory.
     source, target = (t.as_strided((t.numel(),), (1,)) for t in (x, y))
     compute = _short if x.dtype == th.bfloat16 else _full
@@ -60,14 +68,13 @@ def _in_pieces(x: th.Tensor) -> th.Tensor:
 
 
 def _full(x: th.Tensor, out: th.Tensor) -> None:
-    th.clamp(x, max=0, out=out).exp_().sub_(1)
-    th.maximum(x, out, out=out)
+    negative = x.clamp(max=0).exp_().sub_(1)
+    th.maximum(x, negative, out=out)
 
 
 def _short(x: th.Tensor, out: th.Tensor) -> None:
     """In bfloat16, comparisons with 0 and the final choice are cheapest as integers: only the sign bit counts."""
-    bits = x.view(th.int16)
-    th.clamp(bits, max=0, out=out.view(th.int16))
-    out.exp_().sub_(1)
+    bits, result = x.view(th.int16), out.view(th.int16)
+    negative = bits.clamp(max=0).view(x.dtype).exp_().sub_(1)
     # One of the two parts is +0, all bits zero.
-    th.bitwise_or(bits.clamp(min=0), out.view(th.int16), out=out.view(th.int16))
+    th.clamp(bits, min=0, out=result).bitwise_or_(negative.view(th.int16))

@@ -1,8 +1,7 @@
 """An agent's networks made ready for planning on a CPU: the same model with less arithmetic and fewer passes over memory.
 
 A sampled state is S ones among S · K numbers. A product with it is the sum of S rows of the weights, so states keep the ones'
-places and no layer ever reads the other numbers. Everything between two draws stays small enough for the processor's cache:
-one step of the trajectories is scored before the next. Weights are brought into the products' format once a plan.
+places and no layer ever reads the other numbers. Weights are brought into the products' format once a plan.
 """
 
 from __future__ import annotations
@@ -12,20 +11,20 @@ from dataclasses import dataclass
 
 import torch as th
 import torch.nn.functional as F
-from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 #: of a logit above its variable's mean, so that exp stays finite; another class this far above would be drawn as often
 MAX_LOGIT = 80.0
-#: variables drawn at once
-BLOCK = 8
+#: variables drawn at once, and states scored at once: what a processor's cache holds
+BLOCK, ROWS = 8, 2560
 
 
 @dataclass
@@ -98,8 +97,13 @@ class PreparedAgent(PlannedAgent):
 
     @staticmethod
     def _ask(head: _Head, states: Sequence[SampledState], skill: th.Tensor | None = None) -> th.Tensor:
+        classes = th.cat([state.classes for state in states])
+        short = th.cat([state.short for state in states])
+        if skill is not None:
+            short = th.cat([short, skill.to(short.dtype).repeat(len(states), 1)], -1)
         with th.autocast("cpu", enabled=False):
-            return th.stack([head(state, skill) for state in states])
+            parts = [head(*part) for part in zip(classes.split(ROWS), short.split(ROWS), strict=True)]
+        return th.cat(parts).view(len(states), -1, parts[0].shape[-1])
 
 
 class _Head:
@@ -115,16 +119,15 @@ class _Head:
         first, *others = [*mlp.dense, mlp.out]
         stoch_size = variables * classes
         # Each state is the sum of S rows: an S-th of the bias in each.
-        rows = first.weight[:, :stoch_size].T + first.bias / variables
-        self.rows, self.rest = rows.to(dtype).contiguous(), first.weight[:, stoch_size:].to(dtype)
-        self.layers = [(layer.weight.to(dtype), layer.bias.to(dtype)) for layer in others]
+        self.rows = (first.weight[:, :stoch_size].T + first.bias / variables).to(dtype).contiguous()
+        self.rest = PrepackedLinear(first.weight[:, stoch_size:], None, dtype)
+        self.layers = [PrepackedLinear(layer.weight, layer.bias, dtype) for layer in others]
 
-    def __call__(self, state: SampledState, skill: th.Tensor | None) -> th.Tensor:
-        """→ float (n, outputs)."""
-        rest = state.short if skill is None else th.cat([state.short, skill.to(state.short.dtype)], -1)
-        x = th.addmm(F.embedding_bag(state.classes, self.rows, mode="sum"), rest, self.rest.T)
-        for weight, bias in self.layers:
-            x = F.linear(elu(x), weight, bias)
+    def __call__(self, classes: th.Tensor, rest: th.Tensor) -> th.Tensor:
+        """Classes (n, S) and what else the first layer reads, (n, D) or with a skill (n, D + W) → float (n, outputs)."""
+        x = self.rest(rest).add_(F.embedding_bag(classes, self.rows, mode="sum"))
+        for layer in self.layers:
+            x = layer(elu_(x))
         return full(x)
 
 
@@ -138,15 +141,14 @@ class _Dynamics:
     def __init__(self, rssm: RSSM, dtype: th.dtype):
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
         self.rows = rssm.stoch_rows().to(dtype)
-        self.action = rssm.input.weight[:, rssm.stoch_size :].to(dtype)
+        self.action = PrepackedLinear(rssm.input.weight[:, rssm.stoch_size :], rssm.input.bias, dtype)
         self.gru, self.norm = _in_order_of_use(rssm, dtype)
-        self.hidden = _short(rssm.prior_hidden, dtype)
+        self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
         # A constant for each variable changes no probability: logits whose mean is 0 need no search for their largest.
         weight = rssm.prior_logits.weight.view(*self.shape, -1)
         bias = rssm.prior_logits.bias.view(self.shape)
         self.logits_weight = (weight - weight.mean(1, keepdim=True)).to(dtype)
         self.logits_bias = (bias - bias.mean(1, keepdim=True)).unsqueeze(-1)
-        self.input_bias = rssm.input.bias.to(dtype)
         self.first_class = th.arange(0, rssm.stoch_size, self.shape[1])
         self._start: LatentState | None = None
 
@@ -157,7 +159,7 @@ class _Dynamics:
             stoch_part, short = self._start_part(state), state.deter.to(self.dtype)
         else:
             stoch_part, short = F.embedding_bag(state.classes, self.rows, mode="sum"), state.short
-        x = elu(F.linear(action.to(self.dtype), self.action, self.input_bias).add_(stoch_part))
+        x = elu_(self.action(action.to(self.dtype)).add_(stoch_part))
         deter = self._recur(th.cat([x, short], -1), state.deter)
         short = deter.to(self.dtype)
         return SampledState(self._draw(short, generator), deter, short, self.stoch_size)
@@ -169,13 +171,13 @@ class _Dynamics:
         return self._part
 
     def _recur(self, inputs: th.Tensor, deter: th.Tensor) -> th.Tensor:
-        parts = F.layer_norm(full(F.linear(inputs, *self.gru)), self.norm[0].shape, *self.norm)
+        parts = F.layer_norm(full(self.gru(inputs)), self.norm[0].shape, *self.norm)
         size = deter.shape[-1]
         reset, update = parts[:, : 2 * size].sigmoid().chunk(2, -1)
         return th.lerp(deter, reset.mul(parts[:, 2 * size :]).tanh_(), update)
 
     def _draw(self, short: th.Tensor, generator: th.Generator | None) -> th.Tensor:
-        hidden = elu(F.linear(short, *self.hidden)).T
+        hidden = elu_(self.hidden(short)).T
         parts = zip(self.logits_weight.split(BLOCK), self.logits_bias.split(BLOCK), strict=True)
         drawn = [self._draw_block(hidden, weight, bias, generator) for weight, bias in parts]
         return th.cat(drawn, 1).add_(self.first_class)
@@ -190,7 +192,7 @@ class _Dynamics:
         return distributions.draw_classes(probs, generator)
 
 
-def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[tuple[th.Tensor, th.Tensor], tuple[th.Tensor, th.Tensor]]:
+def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[PrepackedLinear, tuple[th.Tensor, th.Tensor]]:
     """The GRU's layer and its norm with the parts (reset, update, candidate), and the bias of the update gate within."""
 
     def ordered(parameter: th.Tensor) -> th.Tensor:
@@ -199,12 +201,8 @@ def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[tuple[th.Tensor, th.T
 
     norm_bias = ordered(rssm.gru_norm.bias)
     norm_bias[rssm.deter_size : 2 * rssm.deter_size] -= 1
-    gru = ordered(rssm.gru.weight).to(dtype), ordered(rssm.gru.bias).to(dtype)
+    gru = PrepackedLinear(ordered(rssm.gru.weight), ordered(rssm.gru.bias), dtype)
     return gru, (ordered(rssm.gru_norm.weight), norm_bias)
-
-
-def _short(layer: nn.Linear, dtype: th.dtype) -> tuple[th.Tensor, th.Tensor]:
-    return layer.weight.to(dtype), layer.bias.to(dtype)
 
 
 def planned(agent: Agent, skill: th.Tensor) -> PlannedAgent:
