@@ -1,8 +1,8 @@
 """ELU, the activation of every network of the agent: torch's where it is fast, cheaper arithmetic on CPUs.
 
-torch computes exp(x) − 1 to the last bit (expm1), which costs three times what exp does. Written as max(x, exp(min(x, 0)) − 1) it
-is off by one rounding of 1, in steps that are each a pass over memory: they go over a piece at a time that stays in the
-processor's cache. The gradient is taken from the output, min(y, 0) + 1, and needs no exp at all.
+torch computes exp(x) − 1 to the last bit (expm1), which costs three times what exp does. Written as
+max(x, exp(min(x, 0)) − 1) it is off by one rounding of 1, in steps that are each a pass over memory: they go over a piece at
+a time that stays in the processor's cache. The gradient is taken from the output, min(y, 0) + 1, and needs no exp at all.
 """
 
 from __future__ import annotations

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch as th
 import torch.nn.functional as F
+from torch import nn
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
+from sb3_dreamer_urlb.behavior.actor_critic import SuccessorCritic
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.precision import full
@@ -82,12 +85,9 @@ class PreparedAgent(PlannedAgent):
         return self._ask(self._reward, feature).squeeze(-1)
 
     def values(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
-        if self.skill is None:
-            return self._ask(self._value, feature).squeeze(-1)
         skill = self._skill_of(feature[0].deter)
         value = self._ask(self._value, feature, skill)
-        # Successor features have one output for each number of the skill.
-        return value.squeeze(-1) if value.shape[-1] == 1 else (value * skill).sum(-1)
+        return (value * skill).sum(-1) if isinstance(self.agent.slow_critic, SuccessorCritic) else value.squeeze(-1)
 
     def discounts(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
         gamma = self.agent.world_model.gamma
@@ -116,7 +116,7 @@ class _Head:
     """
 
     def __init__(self, mlp: MLP, variables: int, classes: int, dtype: th.dtype):
-        first, *others = [*mlp.dense, mlp.out]
+        first, *others = (cast(nn.Linear, layer) for layer in [*mlp.dense, mlp.out])
         stoch_size = variables * classes
         # Each state is the sum of S rows: an S-th of the bias in each.
         self.rows = (first.weight[:, :stoch_size].T + first.bias / variables).to(dtype).contiguous()
@@ -152,9 +152,7 @@ class _Dynamics:
         self.first_class = th.arange(0, rssm.stoch_size, self.shape[1])
         self._start: LatentState | None = None
 
-    def step(
-        self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None
-    ) -> SampledState:
+    def step(self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None) -> SampledState:
         if isinstance(state, LatentState):
             stoch_part, short = self._start_part(state), state.deter.to(self.dtype)
         else:
@@ -183,9 +181,7 @@ class _Dynamics:
         return th.cat(drawn, 1).add_(self.first_class)
 
     @staticmethod
-    def _draw_block(
-        hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, generator: th.Generator | None
-    ) -> th.Tensor:
+    def _draw_block(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, generator: th.Generator | None) -> th.Tensor:
         """Some variables. Classes lie outermost in memory: what is done for each class runs over all states at once."""
         logits = (weight.flatten(0, 1) @ hidden).view(*weight.shape[:2], -1).float()  # (variables, K, n)
         probs = logits.add_(bias).clamp_(max=MAX_LOGIT).exp_().movedim(-1, 0)
