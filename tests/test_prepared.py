@@ -11,6 +11,7 @@ from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.planning import prepacked, prepared
 from sb3_dreamer_urlb.planning.prepared import PreparedAgent, planned
+from sb3_dreamer_urlb.types import LatentState
 
 N, M = 2, 6
 
@@ -32,10 +33,10 @@ def agents(request, world_model, monkeypatch):
 
 def test_same_states_and_scores(agents):
     plain, ready = agents
-    start = plain.agent.world_model.rssm.initial(N * M)
-    start.stoch.normal_(), start.deter.normal_()
+    rssm = plain.agent.world_model.rssm
+    starts = [LatentState(th.randn(N * M, rssm.stoch_size), th.randn(N * M, rssm.deter_size)) for _ in range(2)]
     with th.no_grad(), deterministic_draws():
-        for _ in range(2):  # the second time, the start is known
+        for start in (starts[0], *starts):  # the second time, the start is known
             states = {plain: [start], ready: [start]}
             for _ in range(3):
                 action = th.rand(N * M, 2) * 2 - 1
