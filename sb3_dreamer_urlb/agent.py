@@ -86,6 +86,10 @@ class PlannedAgent:
         """Sample the next state from the prior."""
         return self.agent.world_model.rssm.planning_step(state, action, self._stoch_rows, generator)
 
+    def features(self, states: Sequence[LatentState]) -> th.Tensor:
+        """What the heads read of T successive states, (T, n·M, F)."""
+        return th.stack([state.feature for state in states])
+
     def rewards(self, feature: th.Tensor) -> th.Tensor:
         """The reward head's mean, (…, n·M, F) → (…, n·M)."""
         return self.agent.world_model.reward(feature)

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 ACTION_MARGIN = 1e-6
@@ -25,10 +28,23 @@ def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.
     :param generator: source of randomness, the global one if None
     :return: class indices, int64 (…)
     """
+    if probs.device.type == "cpu" and probs.dim() > 1 and len(probs) > 1 and probs.movedim(0, -1).is_contiguous():
+        return _draw_by_counting(probs, generator)
     cdf = probs.cumsum(-1)
     uniform = th.rand(cdf.shape[:-1] + (1,), generator=generator, device=cdf.device, dtype=cdf.dtype)
     # Rounding can make the product the whole sum, hence the bound.
     return th.searchsorted(cdf, uniform * cdf[..., -1:], right=True).squeeze(-1).clamp_(max=cdf.shape[-1] - 1)
+
+
+def _draw_by_counting(probs: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+    """:func:`draw_classes` where the first dimension is innermost in memory: operations take one class of all rows at once."""
+    cdf = probs.movedim(0, -1).clone()  # (…, K, n)
+    by_class = cdf.unbind(-2)
+    for below, this in pairwise(by_class):
+        this.add_(below)
+    bound = th.empty_like(by_class[-1]).uniform_(generator=generator).mul_(by_class[-1])
+    # In place a comparison gives numbers, which are faster to count than booleans.
+    return cdf.le_(bound.unsqueeze(-2)).sum(-2).clamp_(max=len(by_class) - 1).movedim(-1, 0).long()
 
 
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
@@ -52,7 +68,20 @@ def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> 
     one_hot = one_hot_like(probs, draw_classes(probs.detach(), generator))
     if not probs.requires_grad:
         return one_hot
-    return one_hot + (probs - probs.detach())
+    sample: th.Tensor = _StraightThrough.apply(one_hot, probs)  # type: ignore[no-untyped-call]
+    return sample
+
+
+class _StraightThrough(Function):
+    """The first argument, with the gradient of the second."""
+
+    @staticmethod
+    def forward(ctx: th.autograd.function.FunctionCtx, value: th.Tensor, slope: th.Tensor) -> th.Tensor:
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[None, th.Tensor]:
+        return None, grad
 
 
 def one_hot_like(probs: th.Tensor, classes: th.Tensor) -> th.Tensor:
@@ -78,7 +107,7 @@ def unit_normal_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
 
 
 def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
-    """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images, in one pass over the pixels.
+    """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images.
 
     :param mean: float (…, C, height, width)
     :param target: same shape
@@ -86,7 +115,25 @@ def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
     """
     pixels = mean.shape[-3:].numel()
     images = mean.numel() // pixels
-    return 0.5 * F.mse_loss(mean, target, reduction="sum") / images + pixels * HALF_LOG_2PI
+    distance: th.Tensor = _SquaredDistance.apply(mean, target)  # type: ignore[no-untyped-call]
+    return distance / (2 * images) + pixels * HALF_LOG_2PI
+
+
+class _SquaredDistance(Function):
+    """Of all images together. torch's own loss hands its gradient on in another memory layout than the images have."""
+
+    @staticmethod
+    def forward(ctx: th.autograd.function.FunctionCtx, mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+        difference = mean - target
+        ctx.save_for_backward(difference)
+        distance: th.Tensor = th.linalg.vector_norm(difference, dim=(-3, -2, -1))
+        return distance.square().sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
+        (difference,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return difference * (2 * grad), None
 
 
 class BoundedNormal:

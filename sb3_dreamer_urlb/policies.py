@@ -14,11 +14,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_dreamer_urlb import precision as precisions
 from sb3_dreamer_urlb.actions import make_actions
-from sb3_dreamer_urlb.agent import Agent, PlannedAgent
+from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.observation_checks import checked_observation
 from sb3_dreamer_urlb.planning import DynaMPC
+from sb3_dreamer_urlb.planning.prepared import planned
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
@@ -246,9 +247,9 @@ class DreamerPolicy(BasePolicy):
             generator = self._moved_on(generator, state.steps)
             action = self.actions.random(len(state.action), generator, self.device)
         elif self.planner is not None and self.planning:
-            planned = PlannedAgent(self.agent, skill)
             with precisions.products(self.device, self.planner_dtype):
-                action, plan = self.planner.plan(planned, state.latent, plan, generator, explore=not deterministic)
+                model = planned(self.agent, skill)
+                action, plan = self.planner.plan(model, state.latent, plan, generator, explore=not deterministic)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mode if deterministic else policy.sample(generator)

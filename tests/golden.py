@@ -12,7 +12,7 @@ import json
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from unittest import mock
 
@@ -27,6 +27,7 @@ from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
+from sb3_dreamer_urlb.planning.prepared import planned
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
 from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
@@ -298,8 +299,11 @@ def check_updates(case: Case, worst: Worst) -> None:
         worst.absolute("weights", case.parameter(name), theirs)
 
 
-def check_planner(case: Case, worst: Worst) -> None:
-    """Values, kept mean and action of the planner, step after step of one episode."""
+def check_planner(case: Case, worst: Worst, seen_as: Callable[[Agent, th.Tensor], PlannedAgent]) -> None:
+    """Values, kept mean and action of the planner, step after step of one episode.
+
+    :param seen_as: how the planner sees the agent
+    """
     size, agent = case.size, case.agent
     horizon = case.data["plan0.mean"].shape[0]
     config = PlannerConfig(
@@ -327,7 +331,7 @@ def check_planner(case: Case, worst: Worst) -> None:
             embed = agent.world_model.encoder(agent.world_model.preprocess(given["in.observation"].unsqueeze(0)))
             is_first = th.tensor([step == 0])
             state = agent.world_model.rssm.posterior_step(LatentState(state.stoch, state.deter), action, embed, is_first)
-            action, mean = planner.plan(PlannedAgent(agent, state.deter.new_zeros(1, 0)), state, mean, None, explore=True)
+            action, mean = planner.plan(seen_as(agent, state.deter.new_zeros(1, 0)), state, mean, None, explore=True)
         worst.relative("planner", th.stack(values), case.data[f"plan{step}.values"])
         worst.relative("planner", mean, case.data[f"plan{step}.mean"])
         # The authors return the action unclipped; this package clips it before acting and storing.
@@ -348,7 +352,8 @@ def check(path: str) -> Worst:
         check_forward(case, worst)
         check_updates(case, worst)
         if "plan0.mean" in case.data:
-            check_planner(case, worst)
+            for seen_as in (PlannedAgent, planned):
+                check_planner(case, worst, seen_as)
     return worst
 
 

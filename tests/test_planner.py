@@ -31,6 +31,9 @@ class Toy:
         self.actions.append(action)
         return LatentState(state.stoch, action)
 
+    def features(self, states):
+        return th.stack([state.feature for state in states])
+
     def rewards(self, feature):
         return -(feature[..., A:] - feature[..., :A]).square().sum(-1)
 

@@ -15,6 +15,7 @@ from torch import nn
 from sb3_dreamer_urlb import DreamerV2, memory, nets, precision
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.world_model import convolution, decoder, encoder, rssm
+from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, Phases
 
 
 @pytest.fixture
@@ -120,15 +121,17 @@ LAYERS = [
     (nn.Conv2d(3, 5, 4, 2), 12),
     (nn.ConvTranspose2d(3, 5, 5, 2), 5),
     (nn.ConvTranspose2d(3, 5, 6, 2), 2),
+    (nn.ConvTranspose2d(3, 5, 6, 2), 7),  # phases
+    (nn.ConvTranspose2d(3, 5, 5, 2), 7),  # neither
 ]
 
 
 @pytest.mark.parametrize(("layer", "size"), LAYERS)
-def test_products_of_patches_equal_the_convolution(seeded, layer, size):
+def test_every_form_equals_the_convolution(seeded, layer, size):
     layer = copy.deepcopy(layer).double()
     x = th.randn(4, 3, size, size, dtype=th.float64, requires_grad=True)
     ours, theirs = convolution.convolve(layer, x), layer(x)
-    assert "_Convolution" in ours.grad_fn.name()
+    assert ours.grad_fn.name() == "_ConvolutionBackward"
     slope = th.randn_like(theirs)
     inputs = (x, *layer.parameters())
     grads = [th.autograd.grad(y, inputs, slope) for y in (ours, theirs)]
@@ -136,9 +139,28 @@ def test_products_of_patches_equal_the_convolution(seeded, layer, size):
     assert all(th.allclose(a, b) for a, b in zip(*grads, strict=True))
 
 
+@pytest.mark.parametrize(("side", "form"), [(5, Patches), (6, Phases)])
+@pytest.mark.parametrize("kernel", [5, 6])
+def test_transposed_convolutions_take_the_form_of_their_size(side, kernel, form):
+    found = convolution._form(nn.ConvTranspose2d(3, 5, kernel, 2), th.zeros(1, 3, side, side))
+    assert type(found) is (Direct if (kernel, form) == (5, Phases) else form)
+
+
+@pytest.mark.parametrize("form", [Direct, Patches, Phases])
+def test_the_passes_of_a_form_work_for_both_kinds(seeded, form):
+    """Also those that no layer of today uses."""
+    its, weight = form(4, 2), th.randn(3, 5, 4, 4, dtype=th.float64, requires_grad=True)
+    wide = th.randn(2, 5, 13, 13, dtype=th.float64)  # the last row is not seen
+    narrow = nn.functional.conv2d(wide, weight, stride=2)
+    slope = th.randn_like(narrow)
+    assert th.allclose(its.gather(its.lay_out(wide), weight, None), narrow)
+    assert th.allclose(its.weight(its.lay_out(wide), slope), *th.autograd.grad(narrow, weight, slope))
+    assert th.allclose(its.scatter(slope, weight, None), nn.functional.conv_transpose2d(slope, weight, stride=2))
+
+
 def test_large_images_and_inference_stay_with_the_layer(seeded):
     layer = nn.Conv2d(3, 5, 4, 2)
-    assert "_Convolution" not in convolution.convolve(layer, th.randn(2, 3, 14, 14)).grad_fn.name()
+    assert convolution.convolve(layer, th.randn(2, 3, 14, 14)).grad_fn.name() == "ConvolutionBackward0"
     with th.no_grad():
         x = th.randn(2, 3, 6, 6)
         assert th.equal(convolution.convolve(layer, x), layer(x))

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch as th
-import torch.nn.functional as F
 from torch import nn
 
+from sb3_dreamer_urlb.activation import elu
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
@@ -60,10 +60,10 @@ class ConvDecoder(nn.Module):
         :param feature: float (…, F)
         :return: mean image, float (…, C, height, width)
         """
-        x = F.elu(self._grow(self.input(feature.flatten(0, -2))))
+        x = elu(self._grow(self.input(feature.flatten(0, -2))))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
-            x = F.elu(convolve(deconv, x))
+            x = elu(convolve(deconv, x))
         return full(x).reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:
@@ -71,8 +71,9 @@ class ConvDecoder(nn.Module):
         first = self.deconvs[0]
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
-        y = (x @ first.weight.view(channels, -1)).view(-1, out, height, width)
-        return y + first.bias.to(y.dtype).view(1, -1, 1, 1)
+        # Channels last, as all that follow.
+        y = (x @ first.weight.permute(0, 2, 3, 1).reshape(channels, -1)).view(-1, height, width, out)
+        return (y + first.bias.to(y.dtype)).permute(0, 3, 1, 2)
 
 
 class VectorDecoder(MLP):

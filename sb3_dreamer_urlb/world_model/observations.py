@@ -93,6 +93,9 @@ class Images(Observations):
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
         image = raw if raw.dtype == th.uint8 else raw.to(th.float32)
+        if image.dim() > 3:
+            # Channels last in memory, as convolutions like it; cheapest while a pixel is a byte.
+            image = image.flatten(0, -4).contiguous(memory_format=th.channels_last).view(image.shape)
         return th.div(image if self.low == 0 else image - self.low, self.range).sub_(0.5)
 
     def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.activation import elu
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
 
@@ -137,7 +138,7 @@ class RSSM(nn.Module):
     def _recur(self, state: LatentState, action_part: th.Tensor, stoch_part: th.Tensor | None = None) -> th.Tensor:
         if stoch_part is None:
             stoch_part = F.linear(state.stoch, self.input.weight[:, : self.stoch_size])
-        x = F.elu(stoch_part + action_part)
+        x = elu(stoch_part + action_part)
         parts = self.gru_norm(full(self.gru(th.cat([x, state.deter], -1))))
         reset, candidate, update = parts.chunk(3, -1)
         candidate = th.tanh(th.sigmoid(reset) * candidate)
@@ -145,11 +146,11 @@ class RSSM(nn.Module):
         return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
 
     def _prior(self, deter: th.Tensor) -> th.Tensor:
-        logits = self.prior_logits(F.elu(self.prior_hidden(deter)))
+        logits = self.prior_logits(elu(self.prior_hidden(deter)))
         return full(logits).view(deter.shape[:-1] + self.logits_shape)
 
     def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
-        hidden = F.elu(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
+        hidden = elu(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
         return full(self.post_logits(hidden)).view(deter.shape[:-1] + self.logits_shape)
 
     @staticmethod

@@ -1,0 +1,31 @@
+"""A linear layer whose weights are laid out once for many products on a CPU."""
+
+from __future__ import annotations
+
+import torch as th
+import torch.nn.functional as F
+
+
+class PrepackedLinear:
+    """x · weightᵀ + bias. oneDNN orders weights its own way before each product; here it does so once.
+
+    The two operators are those that torch.compile emits on CPUs; where torch lacks them this is an ordinary product.
+
+    :param weight: float (outputs, inputs)
+    :param bias: float (outputs,), None for none
+    :param dtype: of products
+    """
+
+    def __init__(self, weight: th.Tensor, bias: th.Tensor | None, dtype: th.dtype):
+        self.weight = weight.detach().to(dtype)
+        self.bias = None if bias is None else bias.detach().to(dtype)
+        self.packed: th.Tensor | None = None
+        if th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight"):
+            self.packed = th.ops.mkldnn._reorder_linear_weight(self.weight.contiguous(), None)
+
+    def __call__(self, x: th.Tensor) -> th.Tensor:
+        """(n, inputs) → (n, outputs), in the format of products."""
+        if self.packed is None:
+            return F.linear(x, self.weight, self.bias)
+        y: th.Tensor = th.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, "none", [], "")
+        return y

@@ -1,0 +1,122 @@
+"""The agent made ready for planning on a CPU is the agent."""
+
+from __future__ import annotations
+
+import pytest
+import torch as th
+from golden import deterministic_draws
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.agent import Agent, PlannedAgent
+from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
+from sb3_dreamer_urlb.planning import prepacked, prepared
+from sb3_dreamer_urlb.planning.prepared import PreparedAgent, planned
+from sb3_dreamer_urlb.types import LatentState
+
+N, M = 2, 6
+
+
+@pytest.fixture(params=[(None, False), (None, True), ("diayn", False), ("aps", False)], ids=str)
+def agents(request, world_model, monkeypatch):
+    """The plain and the prepared form of one agent with N environments; several blocks of everything."""
+    monkeypatch.setattr(prepared, "BLOCK", 2)
+    monkeypatch.setattr(prepared, "ROWS", 5)
+    method, discount_head = request.param
+    agent = Agent(world_model(discount_head=discount_head), [8, 8], make_intrinsic_reward(method, {}))
+    # Fresh layers hardly differ from none: biases, norms and logits that matter.
+    with th.no_grad():
+        for parameter in agent.parameters():
+            parameter.copy_(0.5 * th.randn_like(parameter))
+    skill = th.zeros(N, 0) if agent.skills is None else agent.skills.draw(N)
+    return PlannedAgent(agent, skill), PreparedAgent(agent, skill, th.float32)
+
+
+def test_same_states_and_scores(agents):
+    plain, ready = agents
+    rssm = plain.agent.world_model.rssm
+    starts = [LatentState(th.randn(N * M, rssm.stoch_size), th.randn(N * M, rssm.deter_size)) for _ in range(2)]
+    with th.no_grad(), deterministic_draws():
+        for start in (starts[0], *starts):  # the second time, the start is known
+            states = {plain: [start], ready: [start]}
+            for _ in range(3):
+                action = th.rand(N * M, 2) * 2 - 1
+                for its, visited in states.items():
+                    visited.append(its.step(visited[-1], action, None))
+            features = {its: its.features(visited[1:]) for its, visited in states.items()}
+            for a, b in zip(*states.values(), strict=True):
+                assert th.allclose(a.feature, b.feature, atol=1e-5)
+            for ask in (PlannedAgent.rewards, PlannedAgent.values, PlannedAgent.discounts):
+                a, b = (getattr(its, ask.__name__)(feature[1:]) for its, feature in features.items())
+                assert a.shape == (2, N * M) and th.allclose(a, b, atol=1e-5), ask.__name__
+            a, b = (its.act(visited[-1].feature, None) for its, visited in states.items())
+            assert th.allclose(a, b, atol=1e-5)
+
+
+def test_short_products_stay_close(world_model):
+    agent = Agent(world_model(), [8, 8], None)
+    state, action = agent.world_model.rssm.initial(M), th.rand(M, 2)
+    scores = []
+    for dtype in (th.float32, th.bfloat16):
+        ready = PreparedAgent(agent, th.zeros(1, 0), dtype)
+        with th.no_grad(), deterministic_draws():
+            first = ready.step(state, action, None)
+            features = ready.features([ready.step(first, action, None)])
+            scores.append(ready.values(features))
+        assert scores[-1].dtype == first.deter.dtype == th.float32 and first.short.dtype == dtype
+    assert not th.equal(*scores) and th.allclose(*scores, atol=0.05)
+
+
+def test_extreme_logits_are_drawn(world_model):
+    """One class far above the others, by more than exp can hold."""
+    agent = Agent(world_model(), [8], None)
+    rssm = agent.world_model.rssm
+    with th.no_grad():
+        rssm.prior_logits.weight.zero_()
+        rssm.prior_logits.bias.view(rssm.logits_shape)[:, 2] = 1000.0
+        ready = PreparedAgent(agent, th.zeros(1, 0), th.float32)
+        state = ready.step(rssm.initial(M), th.zeros(M, 2), None)
+    assert th.equal(state.classes, (th.arange(0, rssm.stoch_size, 4) + 2).expand(M, -1))
+
+
+def test_which_form_and_format(world_model):
+    agent, skill = Agent(world_model(), [8], None), th.zeros(1, 0)
+    assert type(planned(agent, skill)) is PreparedAgent
+    assert type(planned(agent, skill.to("meta"))) is PlannedAgent
+    assert planned(agent, skill)._reward.rows.dtype == th.float32
+    with th.autocast("cpu", th.bfloat16):
+        assert planned(agent, skill)._reward.rows.dtype == th.bfloat16
+
+
+@pytest.mark.parametrize("bias", [None, th.randn(3)], ids=["no bias", "bias"])
+def test_prepacked_with_and_without_the_operators(monkeypatch, bias):
+    weight, x = th.randn(3, 7), th.randn(5, 7)
+    expected = th.nn.functional.linear(x, weight, bias)
+    packed = prepacked.PrepackedLinear(weight, bias, th.float32)
+    monkeypatch.setattr(th.backends.mkldnn, "is_available", lambda: False)
+    plain = prepacked.PrepackedLinear(weight, bias, th.float32)
+    assert plain.packed is None
+    assert th.allclose(packed(x), expected, atol=1e-6) and th.equal(plain(x), expected)
+
+
+# -- draws with the first dimension innermost ------------------------------------------------------------------------------
+
+
+def test_draws_invert_the_same_distribution():
+    probs = th.rand(3, 4, 50)  # (S, K, n)
+    uniform = th.rand((3, 50), generator=th.Generator().manual_seed(5))
+    drawn = distributions.draw_classes(probs.movedim(-1, 0), th.Generator().manual_seed(5))
+    cdf = probs.cumsum(1)
+    expected = (cdf <= (uniform * cdf[:, -1]).unsqueeze(1)).sum(1)
+    assert drawn.shape == (50, 3) and drawn.dtype == th.int64
+    assert th.equal(drawn, expected.T) and expected.unique().tolist() == [0, 1, 2, 3]
+
+
+def test_a_draw_leaves_the_probabilities_alone_and_never_runs_over():
+    probs = th.rand(2, 4, 5).movedim(-1, 0)
+    before = probs.clone()
+    distributions.draw_classes(probs)
+    assert th.equal(probs, before)
+    # A uniform number that rounds to the whole sum.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(th.Tensor, "uniform_", lambda self, generator=None: self.fill_(1.0))
+        assert (distributions.draw_classes(probs) == 3).all()
