@@ -13,10 +13,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, numerical_faults, phases
+from sb3_dreamer_urlb import arguments, numerical_faults, phases, training_loop
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
@@ -85,6 +85,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     :param device: "auto", "cpu", "cuda"
     :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
         faster on this machine at this size; losses, statistics and weights are float32 in any case
+    :param overlap: let environments in other processes step while an update runs; the result is the same, bit for bit. False
+        lets them take turns
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -139,6 +141,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
         precision: str = "auto",
+        overlap: bool = True,
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -184,6 +187,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.weight_decay = weight_decay
         self.discount_head = discount_head
         self.precision = precision
+        self.overlap = overlap
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -377,23 +381,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
                 total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
             )
             callbacks.on_training_start(locals(), globals())
-            assert self.env is not None and isinstance(self.train_freq, TrainFreq)
-            while self.num_timesteps < total_timesteps:
-                rollout = self.collect_rollouts(
-                    self.env,
-                    callbacks,
-                    self.train_freq,
-                    self.replay_buffer,
-                    self.action_noise,
-                    self.learning_starts,
-                    log_interval,
-                )
-                if not rollout.continue_training:
-                    break
-                # SB3 gates on num_timesteps, which every learn() resets.
-                if self.phase_timesteps > self.learning_starts:
-                    steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
-                    self.train(steps, self.batch_size)
+            training_loop.learn(self, total_timesteps, callbacks, log_interval)
             callbacks.on_training_end()
             return self
 

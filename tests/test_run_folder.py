@@ -41,7 +41,7 @@ def vec_env(n_envs=1, length=LENGTH, **kwargs):
 def everything(model) -> dict[str, object]:
     """All that a run is made of: weights, moments, counters, replay, random states."""
     buffer = model.replay_buffer
-    episodes = [b"".join(rows[: len(e)].tobytes() for rows in e.columns.values()) for e in buffer.episodes]
+    episodes = [b"".join(rows.tobytes() for rows in e.rows(0, len(e)).values()) for e in buffer.episodes]
     return {
         "weights": {name: value.numpy().tobytes() for name, value in model.policy.state_dict().items()},
         "moments": {
