@@ -243,6 +243,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.learner.updates = self.phase_updates
         if self.verbose >= 1:
             print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
+            print(f"Replay in the store {self.replay_buffer.store!r}")
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
@@ -328,6 +329,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         pretrained = self.policy.agent
         self.phase = phases.FINETUNING
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
+        self.replay_buffer.close()
         del self.replay_buffer
         self._build()
         phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
@@ -418,6 +420,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             self._metrics.add(self.learner.update(batch))
+            # While the device works on the update, and until the next one.
+            self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
         numerical_faults.stop_if_repeated(self)
