@@ -18,14 +18,14 @@ GOLDEN ?= tests/golden/*.npz
 
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := $(wildcard sb3_dreamer_urlb tests benchmarks custom_envs.py)
+SOURCES := $(wildcard sb3_dreamer_urlb tests benchmarks scripts examples custom_envs.py)
 export PYTHON TORCH_INDEX VENV
 
 # Workers share the cores: one thread each, for torch and for the software renderer.
 ONE_THREAD := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} LP_NUM_THREADS=$${LP_NUM_THREADS:-0}
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-gl demo test test-slow faults format lint type bench golden constraints clean clean-venv
+.PHONY: help setup setup-gl demo test test-slow faults format lint type docs bench golden constraints clean clean-venv
 
 help:  ## list the targets
 	@echo "make TARGET, where TARGET is one of"
@@ -54,6 +54,10 @@ lint: setup  ## find faults, and code that 'make format' would change
 type: setup  ## check the types
 	$(BIN)/mypy
 
+# Not --quiet: it would hide the warnings from --strict. The variable silences an advertisement of the theme's maker, which is no warning of ours.
+docs: setup  ## build the documentation into site/; any warning fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 bench: setup-gl  ## time the update and the planner (BENCH_ARGS)
 	$(BIN)/python benchmarks/update.py $(BENCH_ARGS)
 	$(BIN)/python benchmarks/planner.py $(BENCH_ARGS)
@@ -71,7 +75,7 @@ setup-gl:  ## only make the virtual environment, and see to a GL library
 	@scripts/setup.sh gl
 
 clean:  ## remove caches and build output
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis demo_output
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis demo_output site
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 clean-venv: clean  ## remove the virtual environment, too

@@ -1,8 +1,9 @@
-"""Learn CartPole-v1 or Pendulum-v1 from vectors on a CPU, and draw the learning curve.
+"""Learn CartPole-v1 or Pendulum-v1 from vectors on a CPU, and draw the learning curves.
 
     python benchmarks/vector_tasks.py CartPole-v1 --seeds 0 1 2 --out docs/images
 
-Writes ``<task>.csv`` (agent steps, CPU seconds, return of every episode) and, with matplotlib, ``<task>.png``.
+The hyperparameters are those of ``zoo_configs/vectors.yml``. Each seed writes ``<task>_<seed>.csv`` (agent steps, CPU seconds
+and return of every episode); ``<task>.png`` shows all that lie there (matplotlib).
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch as th
+import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -24,25 +25,22 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 
+CONFIG = Path(__file__).parents[1] / "zoo_configs" / "vectors.yml"
+#: mean return of 100 episodes of random actions
+RANDOM = {"CartPole-v1": 22.0, "Pendulum-v1": -1200.0}
 
-@dataclass(frozen=True)
-class Task:
+
+@dataclass
+class Run:
     """
-    :param steps: agent steps of a run
-    :param arguments: of the constructor
-    :param random: return of random actions
+    :param rows: agent steps, CPU seconds since the start and return of every episode
+    :param scores: returns of deterministic episodes at the end
+    :param seconds: CPU time of training
     """
 
-    steps: int
-    arguments: dict[str, Any]
-    random: float
-
-
-TASKS = {
-    # Random episodes have about 20 steps, and a sequence must fit into one.
-    "CartPole-v1": Task(10_000, {"batch_length": 10, "batch_size": 24}, 22.0),
-    "Pendulum-v1": Task(12_000, {}, -1200.0),
-}
+    rows: list[tuple[int, float, float]]
+    scores: np.ndarray
+    seconds: float
 
 
 class Curve(BaseCallback):
@@ -60,25 +58,36 @@ class Curve(BaseCallback):
         return True
 
 
-def learn(name: str, seed: int, steps: int | None = None) -> tuple[list[tuple[int, float, float]], float]:
+def settings(task: str) -> tuple[int, dict[str, Any]]:
+    """Agent steps and constructor arguments of a task in ``zoo_configs/vectors.yml``."""
+    entry = dict(yaml.safe_load(CONFIG.read_text())[task])
+    # rl_zoo3's "normalize" is SB3's VecNormalize, see learn().
+    assert entry.pop("normalize") is True
+    return entry.pop("n_timesteps"), entry
+
+
+def learn(task: str, seed: int, steps: int | None = None, episodes: int = 20, **changes: Any) -> Run:
     """One run.
 
-    :param name: key of ``TASKS``
+    :param task: CartPole-v1 or Pendulum-v1
     :param seed: of everything
     :param steps: agent steps, the task's own if None
-    :return: rows of :class:`Curve`, and the mean return of ten deterministic episodes
+    :param episodes: of the evaluation, with other starts than those of training
+    :param changes: constructor arguments to replace
     """
-    task = TASKS[name]
-    env = VecNormalize(make_vec_env(name, 1, seed=seed), norm_reward=False)
-    model = DreamerV2("MlpPolicy", env, seed=seed, device="cpu", preset="vector", **task.arguments)
+    default_steps, arguments = settings(task)
+    env = VecNormalize(make_vec_env(task, 1, seed=seed))
+    model = DreamerV2(env=env, seed=seed, device="cpu", **{**arguments, **changes})
     curve = Curve()
-    model.learn(task.steps if steps is None else steps, curve)
-    env.training = False
-    score, _ = evaluate_policy(model, env, n_eval_episodes=10)
-    return curve.rows, float(score)  # type: ignore[arg-type]
+    model.learn(default_steps if steps is None else steps, curve)
+    seconds = time.process_time() - curve.began
+    unseen = VecNormalize(make_vec_env(task, 1, seed=seed + 1000), training=False)
+    unseen.obs_rms = env.obs_rms
+    scores, _ = evaluate_policy(model, unseen, n_eval_episodes=episodes, return_episode_rewards=True)
+    return Run(curve.rows, np.array(scores), seconds)
 
 
-def draw(name: str, runs: dict[int, list[tuple[int, float, float]]], path: Path) -> None:
+def draw(task: str, folder: Path) -> None:
     """Mean of ten episodes over agent steps, a line a seed, and random actions."""
     import matplotlib
 
@@ -86,37 +95,44 @@ def draw(name: str, runs: dict[int, list[tuple[int, float, float]]], path: Path)
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(6, 3.5), layout="constrained")
-    for seed, rows in runs.items():
-        returns = [row[2] for row in rows]
-        means = [np.mean(returns[max(0, i - 9) : i + 1]) for i in range(len(returns))]
-        axes.plot([row[0] for row in rows], means, label=f"seed {seed}")
-    axes.axhline(TASKS[name].random, color="grey", linestyle=":", label="random actions")
-    axes.set(title=f"{name}, vectors", xlabel="agent steps", ylabel="return (mean of 10 episodes)")
+    for path in sorted(folder.glob(f"{stem(task)}_*.csv")):
+        steps, _, returns = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
+        means = [returns[max(0, i - 9) : i + 1].mean() for i in range(len(returns))]
+        axes.plot(steps, means, label=f"seed {path.stem.split('_')[1]}")
+    axes.axhline(RANDOM[task], color="grey", linestyle=":", label="random actions")
+    axes.set(title=f"{task}, vectors", xlabel="agent steps", ylabel="return (mean of 10 episodes)")
     axes.legend()
-    figure.savefig(path, dpi=110)
+    figure.savefig(folder / f"{stem(task)}.png", dpi=110)
+
+
+def stem(task: str) -> str:
+    """Of a task's files."""
+    return task.split("-")[0].lower()
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=sorted(TASKS))
+    parser.add_argument("task", choices=sorted(RANDOM))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--steps", type=int, help="agent steps (default: the task's own)")
+    parser.add_argument("--episodes", type=int, default=20, help="of the evaluation at the end (default: 20)")
     parser.add_argument("--out", type=Path, default=Path("."))
     options = parser.parse_args()
-    gymnasium.spec(options.task)
     th.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    runs = {}
     for seed in options.seeds:
-        runs[seed], score = learn(options.task, seed, options.steps)
-        print(f"{options.task} seed {seed}: {score:.1f} after {runs[seed][-1][1]:.0f} s of CPU time", flush=True)
-    stem = options.task.split("-")[0].lower()
-    with open(options.out / f"{stem}.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["seed", "steps", "cpu_seconds", "return"])
-        writer.writerows((seed, *row) for seed, rows in runs.items() for row in rows)
-    draw(options.task, runs, options.out / f"{stem}.png")
+        run = learn(options.task, seed, options.steps, options.episodes)
+        with open(options.out / f"{stem(options.task)}_{seed}.csv", "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["steps", "cpu_seconds", "return"])
+            writer.writerows((steps, f"{seconds:.1f}", f"{score:.1f}") for steps, seconds, score in run.rows)
+        print(
+            f"{options.task} seed {seed}: {run.scores.mean():.1f} ± {run.scores.std():.1f}, worst {run.scores.min():.1f}, "
+            f"after {run.seconds:.0f} s of CPU time",
+            flush=True,
+        )
+    draw(options.task, options.out)
 
 
 if __name__ == "__main__":

@@ -96,7 +96,7 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
         normalizer = self._vec_normalize_env
         if normalizer is None:
-            self._last_original_obs, original_obs = self._last_obs, new_obs  # type: ignore[assignment]
+            self._last_original_obs, original_obs = self._last_obs, new_obs
         else:
             original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
         self.env_faults += env_steps.count_faults(infos)
@@ -109,7 +109,7 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         assert self._acting_state is not None
         skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
-        self._last_obs, self._last_original_obs = new_obs, original_obs  # type: ignore[assignment]
+        self._last_obs, self._last_original_obs = new_obs, original_obs
         self._last_episode_starts = dones.astype(bool)
 
     def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
@@ -125,7 +125,7 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         self.replay_buffer.close_streams()
         self._last_obs = self.env.reset()  # type: ignore[assignment]
         if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
         self._last_episode_starts = np.ones(self.env.num_envs, bool)
 
     def prepare_env(self, env: GymEnv) -> VecEnv:
@@ -162,6 +162,6 @@ def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: 
     """Replace the observation of environment ``i``."""
     if isinstance(observations, dict):
         for name, values in observations.items():
-            values[i] = observation[name]  # type: ignore[call-overload]
+            values[i] = observation[name]
     else:
         observations[i] = observation

@@ -6,6 +6,7 @@ Inside the agent an action is a float vector, (n, A): numbers in [-1, 1], or one
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -95,7 +96,7 @@ class ClassActions(Actions):
         return self.space.shape
 
 
-def make_actions(space: spaces.Space) -> Actions:
+def make_actions(space: spaces.Space[Any]) -> Actions:
     """The kind of an action space.
 
     :param space: of the environment

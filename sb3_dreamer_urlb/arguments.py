@@ -11,12 +11,14 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -38,6 +40,7 @@ NUMBERS = {
     "gae_lambda": (0.0, True, 1.0, True),
     "kl_balance": (0.0, True, 1.0, True),
     "free_nats": (0.0, True, math.inf, False),
+    "kl_scale": (0.0, True, math.inf, False),
     "adam_eps": (0.0, False, math.inf, False),
     "max_grad_norm": (0.0, False, math.inf, True),
     "weight_decay": (0.0, True, 1.0, False),
@@ -96,12 +99,14 @@ def check(model: DreamerV2) -> None:
     _check_policy_kwargs(model)
     _check_spaces(model)
     if model.env is not None:
-        _check_episode_fits(model.env, model.batch_length)
+        _check_episode_fits(model, model.env)
 
 
 def _check_names(model: DreamerV2) -> None:
     if model.precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
+    if model.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
+        raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {model.actor_gradient!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:
@@ -132,6 +137,9 @@ def _check_spaces(model: DreamerV2) -> None:
         raise ValueError("DreamerV2 needs an environment: env is None.")
     normalize_images = model.policy_kwargs.get("normalize_images", True)
     model.policy_class.check_spaces(model.observation_space, model.action_space, normalize_images)
+    if model.actor_gradient == REINFORCE and not make_actions(model.action_space).classes:
+        # The density of a clamped action is not the normal's.
+        raise ValueError(f"actor_gradient='reinforce' needs Discrete or MultiDiscrete actions, got {model.action_space}.")
     if model.action_noise is not None and make_actions(model.action_space).classes:
         raise ValueError(f"action_noise={model.action_noise!r} needs a Box action space, got {model.action_space}.")
 
@@ -150,10 +158,13 @@ def check_env(model: DreamerV2, env: VecEnv) -> None:
             "To change it, load a snapshot with the new ones: DreamerV2.load(path, env=...)."
         )
     check_for_correct_spaces(env, model.observation_space, model.action_space)
-    _check_episode_fits(env, model.batch_length)
+    _check_episode_fits(model, env)
 
 
-def _check_episode_fits(env: VecEnv, batch_length: int) -> None:
+def _check_episode_fits(model: DreamerV2, env: VecEnv) -> None:
+    if model.replay_buffer_kwargs.get("sampling", BY_EPISODE) != BY_EPISODE:
+        return
+    batch_length = model.batch_length
     steps = env_attribute(env, "max_episode_steps", None)
     if steps is None:
         steps = getattr(env_attribute(env, "spec", None), "max_episode_steps", None)
@@ -169,10 +180,11 @@ def check_episode_length(buffer: SequenceReplayBuffer) -> None:
 
     :raises ValueError: after ``SHORT_EPISODES`` of them
     """
-    if buffer.finished_count >= SHORT_EPISODES:
+    if buffer.sampling == BY_EPISODE and buffer.finished_count >= SHORT_EPISODES:
         raise ValueError(
             f"batch_length={buffer.batch_length} is longer than any of the first {buffer.finished_count} episodes "
-            f"(the longest had {buffer.longest} rows): choose a smaller batch_length."
+            f"(the longest had {buffer.longest} rows): choose a smaller batch_length, or "
+            "replay_buffer_kwargs={'sampling': 'rows'}."
         )
 
 

@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_dreamer_urlb import arguments, numerical_faults, phases, training_loop
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
@@ -69,6 +70,10 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     :param ent_coef: weight of the actor's entropy; None: 0 while exploring, 1e-4 on a task
     :param free_nats: the KL that costs nothing
     :param kl_balance: share of the KL's gradient that trains the prior
+    :param kl_scale: weight of the KL in the model's loss
+    :param actor_gradient: ``"dynamics"``: through the model, straight through where actions are one-hot; ``"reinforce"``: by
+        the score function, for Discrete and MultiDiscrete actions; ``"auto"``: REINFORCE for these, dynamics for Box (as
+        DreamerV2)
     :param target_update_interval: updates between two copies of the critic to the slow critic
     :param adam_eps: ε of all optimisers
     :param max_grad_norm: bound of each optimiser's gradient norm
@@ -126,6 +131,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         ent_coef: float | None = None,
         free_nats: float = 1.0,
         kl_balance: float = 0.8,
+        kl_scale: float = 1.0,
+        actor_gradient: str = AUTO,
         target_update_interval: int = 100,
         adam_eps: float = 1e-5,
         max_grad_norm: float = 100.0,
@@ -181,6 +188,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.ent_coef = ent_coef
         self.free_nats = free_nats
         self.kl_balance = kl_balance
+        self.kl_scale = kl_scale
+        self.actor_gradient = actor_gradient
         self.target_update_interval = target_update_interval
         self.adam_eps = adam_eps
         self.max_grad_norm = max_grad_norm
@@ -278,6 +287,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             weight_decay=self.weight_decay,
             free_nats=self.free_nats,
             kl_balance=self.kl_balance,
+            kl_scale=self.kl_scale,
+            actor_gradient=choose_gradient(self.actor_gradient, make_actions(self.action_space).classes),
             imagination_horizon=self.imagination_horizon,
             gae_lambda=self.gae_lambda,
             target_update_interval=self.target_update_interval,
@@ -288,7 +299,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
         buffer_class: Any = self.replay_buffer_class or SequenceReplayBuffer
-        return buffer_class(
+        buffer: SequenceReplayBuffer = buffer_class(
             self.buffer_size,
             self.observation_space,
             self.action_space,
@@ -302,6 +313,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
                 **self.replay_buffer_kwargs,
             },
         )
+        return buffer
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
@@ -400,7 +412,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             self.replay_buffer.close_streams()
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)  # type: ignore[assignment]
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
         return result
 
     def train(self, gradient_steps: int, batch_size: int) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch as th
 from torch import nn
@@ -15,12 +15,13 @@ from torch import nn
 from sb3_dreamer_urlb import precision
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
+from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.memory import keep_freed_memory
 from sb3_dreamer_urlb.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.optim import ClippedAdam
-from sb3_dreamer_urlb.types import LatentState, Metrics, Observation, Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class LearnerConfig:
     ent_coef: float
     reward_trains_model: bool
     precision: str = "float32"
+    kl_scale: float = 1.0
+    actor_gradient: str = DYNAMICS
 
 
 class Learner:
@@ -113,7 +116,7 @@ class Learner:
         metrics = self._update_intrinsic(_detached(posterior), batch)
         metrics.update(self._update_world_model(posterior, observation, batch))
         if self.agent.trains_behavior():
-            metrics.update(self._update_behavior(posterior.state.detach()))
+            metrics.update(self._update_behavior(posterior.state.detach(), batch.is_terminal))
             if self.agent.explores:
                 metrics["intrinsic_reward"] = metrics["imagined_reward"]
         self.updates += 1
@@ -142,6 +145,7 @@ class Learner:
                 config.free_nats,
                 config.kl_balance,
                 config.reward_trains_model,
+                config.kl_scale,
             )
         if reward is not batch.reward:
             metrics["intrinsic_replay_reward"] = reward.mean()
@@ -149,20 +153,25 @@ class Learner:
         metrics["model_grad_norm"] = self.model_optimizer.step(loss)
         return metrics
 
-    def _update_behavior(self, start: LatentState) -> Metrics:
+    def _update_behavior(self, start: LatentState, is_terminal: th.Tensor) -> Metrics:
         agent, config = self.agent, self.config
-        start = start.flatten()
+        start, goes_on = start.flatten(), (~is_terminal).flatten().to(start.deter.dtype)
         skill = None if agent.skills is None else agent.skills.sample(start.deter.shape[0])
         with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic), self._products():
-            imagination = agent.world_model.imagine(agent.actor, start, config.imagination_horizon, skill)
+            imagination, log_prob = self._imagine(start, skill)
             raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
             reward = agent.reward_normalizer(raw_reward)
-            discount = agent.world_model.discount(imagination.feature)
+            discount = agent.world_model.discount(imagination.feature, goes_on)
             value = agent.slow_critic(imagination.feature, skill)
             weight = actor_critic.discount_weights(discount.detach())
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
-            loss = actor_critic.actor_loss(target, weight)
+            # Nothing is chosen where the episode is over, though a dream begins there.
+            chosen = weight * goes_on
+            if log_prob is None:
+                loss = actor_critic.actor_loss(target, chosen)
+            else:
+                loss = actor_critic.reinforce_loss(target, value, chosen, log_prob, imagination.entropy, config.ent_coef)
         actor_grad_norm = self.actor_optimizer.step(loss)
         with self._products():
             value_now = agent.critic(imagination.feature[:-1].detach(), skill)
@@ -178,6 +187,17 @@ class Learner:
             "critic_grad_norm": critic_grad_norm,
             "critic": value_now.detach().mean(),
         }
+
+    def _imagine(self, start: LatentState, skill: th.Tensor | None) -> tuple[Imagination, th.Tensor | None]:
+        """Dreams, and what REINFORCE needs: log-probabilities of their actions, float (H, N), else None."""
+        agent, horizon = self.agent, self.config.imagination_horizon
+        if self.config.actor_gradient == DYNAMICS:
+            return agent.world_model.imagine(agent.actor, start, horizon, skill), None
+        with th.no_grad():
+            imagination = agent.world_model.imagine(agent.actor, start, horizon, skill)
+        # Once more with gradients, in one pass over all steps.
+        policy = agent.actor(imagination.feature[:-1], skill)
+        return replace(imagination, entropy=policy.entropy()), policy.log_prob(imagination.action[1:])
 
 
 def _detached(posterior: Posterior) -> Posterior:

@@ -127,7 +127,7 @@ class LogEvery(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.n_calls % self.steps == 0:
-            self.model.dump_logs()  # type: ignore[attr-defined]
+            self.model.dump_logs()
         return True
 
 

@@ -81,8 +81,8 @@ class DreamerPolicy(BasePolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         deter_size: int = 200,
         hidden_size: int = 200,
@@ -135,7 +135,9 @@ class DreamerPolicy(BasePolicy):
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
 
     @classmethod
-    def check_spaces(cls, observation_space: spaces.Space, action_space: spaces.Space, normalize_images: bool = True) -> None:
+    def check_spaces(
+        cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool = True
+    ) -> None:
         """
         :raises UnsupportedSpaceError: for a space that this policy does not take
         """
@@ -143,7 +145,7 @@ class DreamerPolicy(BasePolicy):
         make_actions(action_space)
 
     @classmethod
-    def _observations(cls, space: spaces.Space, normalize_images: bool) -> Observations:
+    def _observations(cls, space: spaces.Space[Any], normalize_images: bool) -> Observations:
         return cls.kind_of_observations(space, normalize_images)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -162,7 +164,7 @@ class DreamerPolicy(BasePolicy):
 
     # -- saving --------------------------------------------------------------------------------------------------------
 
-    def save(self, path: Target) -> None:  # type: ignore[override]
+    def save(self, path: Target) -> None:
         """Write the policy, in a form that can never run code.
 
         :param path: path, taken as it is, or binary file object
@@ -170,7 +172,7 @@ class DreamerPolicy(BasePolicy):
         policy_snapshot.save(self, path)
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfDreamerPolicy],
         path: Target,
         device: th.device | str = "auto",

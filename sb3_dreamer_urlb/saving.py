@@ -33,9 +33,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
         return ["policy", *optimizers], []
 
-    def save(  # type: ignore[override]
-        self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
+    def save(self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """Write the model, without replay and environment, in a form that can never run code.
 
         :param path: path (``.zip`` is added where it has no suffix; written atomically), or binary file object
@@ -49,7 +47,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         model_snapshot.save(_whole(self), path)
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfSavingAlgorithm],
         path: Target,
         env: GymEnv | str | None = None,
@@ -76,7 +74,9 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         """
         whole: Any = cls
         arguments.check_load_keywords(whole, kwargs)
-        return model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)[0]
+        model: SelfSavingAlgorithm
+        model, _ = model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)
+        return model
 
     @classmethod
     def resume(
@@ -106,7 +106,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
             whole, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
         )
 
-    def set_parameters(  # type: ignore[override]
+    def set_parameters(
         self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """Take over weights and the optimisers' moments.
@@ -121,14 +121,14 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         else:
             model_snapshot.set_parameters(_whole(self), load_path_or_dict, exact_match)
 
-    def save_replay_buffer(self, path: Target) -> None:  # type: ignore[override]
+    def save_replay_buffer(self, path: Target) -> None:
         """Write the replay, open episodes included, in a form that can never run code.
 
         :param path: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
         """
         replay_snapshot.save(self.replay_buffer, path)
 
-    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:  # type: ignore[override]
+    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:
         """Go on with a saved replay buffer.
 
         :param path: what :meth:`save_replay_buffer` wrote

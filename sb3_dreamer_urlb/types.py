@@ -132,7 +132,10 @@ class Imagination:
 class ModelSizes:
     """Sizes that a head or an intrinsic reward needs to know.
 
-    :param action: A, :param embed: E, :param feature: F, :param deter: D
+    :param action: A
+    :param embed: E
+    :param feature: F
+    :param deter: D
     :param net_arch: widths of the hidden layers of every head, actor and critic
     :param observations: what the model sees
     :param cnn_depth: channels of the encoder's first convolution

@@ -295,6 +295,12 @@ def test_a_run_of_short_episodes_stops(tiny_model):
     assert SHORT_EPISODES <= model.replay_buffer.finished_count < SHORT_EPISODES + 4
 
 
+def test_short_episodes_are_enough_where_sequences_run_through_several(tiny_model):
+    env = CounterEnv([1, 2], max_episode_steps=2, terminates=True)
+    model = tiny_model(env, batch_length=10, replay_buffer_kwargs={"sampling": "rows"}).learn(200)
+    assert model._n_updates > 0
+
+
 def test_a_long_episode_among_short_ones_is_enough(tiny_model):
     model = tiny_model(CounterEnv([1] * 30 + [5]), batch_length=4).learn(200)
     assert model._n_updates > 0

@@ -5,16 +5,19 @@ from __future__ import annotations
 import contextlib
 import copy
 
+import numpy as np
 import pytest
 import torch as th
-from conftest import infer
+from conftest import LEARNER, infer
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import Actor, Critic, RewardNormalizer, SuccessorCritic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic import RewardSource
+from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 
 SYNCHRONISING = ["item", "cpu", "numpy", "tolist", "__bool__", "__float__", "__int__", "__index__", "__array__"]
 
@@ -71,6 +74,33 @@ def test_losses_by_hand(seeded):
     assert th.allclose(SuccessorCritic(1, [1], 2).loss(value, target, weight), squares.mean())
 
 
+def test_reinforce_by_hand(seeded):
+    target, weight, log_prob, entropy = (th.randn(4, 3, requires_grad=True) for _ in range(4))
+    value = th.randn(5, 3, requires_grad=True)
+    loss = actor_critic.reinforce_loss(target, value, weight.detach(), log_prob, entropy, 0.3)
+    terms = [
+        weight[t, n] * (log_prob[t, n] * (target[t + 1, n] - value[t, n]) + 0.3 * entropy[t, n])
+        for t in range(3)
+        for n in range(3)
+    ]
+    assert th.allclose(loss, -sum(terms) / 9)
+    gradients = th.autograd.grad(loss, [target, value, log_prob, entropy], allow_unused=True)
+    assert gradients[0] is None and gradients[1] is None and all(g[:3].abs().min() > 0 for g in gradients[2:])
+
+
+@pytest.mark.parametrize(
+    ("given", "classes", "chosen"),
+    [
+        ("auto", (), "dynamics"),
+        ("auto", (2, 3), "reinforce"),
+        ("dynamics", (2, 3), "dynamics"),
+        ("reinforce", (2,), "reinforce"),
+    ],
+)
+def test_which_gradient(given, classes, chosen):
+    assert actor_critic.choose_gradient(given, classes) == chosen
+
+
 def test_actor_distribution(seeded):
     actor = Actor(6, 2, [8, 8])
     feature = 3 * th.randn(50, 6)
@@ -108,7 +138,7 @@ def test_behaviour_changes_actor_and_critic_only(learner, batch, weights, intrin
     posterior = infer(its.agent.world_model, batch)
     before = {name: weights(module) for name, module in its.agent.named_children()}
     its.updates = 1  # no slow copy
-    its._update_behavior(posterior.state.detach())
+    its._update_behavior(posterior.state.detach(), batch.is_terminal)
     changed = {name for name, module in its.agent.named_children() if weights(module) != before[name]}
     # LBS normalises its rewards, the task does not.
     assert changed == {"actor", "critic"} | ({"reward_normalizer"} if intrinsic else set())
@@ -151,12 +181,46 @@ def test_actor_climbs_the_imagined_reward(learner, batch, sign):
 
     def imagined(actor_learning_rate, updates):
         its.actor_optimizer.set_learning_rate(actor_learning_rate)
-        return th.stack([its._update_behavior(state)["imagined_reward"] for _ in range(updates)])
+        return th.stack([its._update_behavior(state, batch.is_terminal)["imagined_reward"] for _ in range(updates)])
 
     before = imagined(0.0, 40)
     imagined(1e-2, 150)
     after = imagined(0.0, 40)
     assert after.mean() > before.mean() + before.std()
+
+
+@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
+def test_choices_climb_the_imagined_reward(world_model, batch, gradient):
+    """The reward is the first of two classes; the model remembers the choice in its state, and nothing else."""
+    agent = Agent(world_model(), [8], None, classes=(2,))
+    its = Learner(agent, LearnerConfig(**{**LEARNER, "learning_rate": 0.0, "actor_gradient": gradient}))
+
+    class FirstClass(RewardSource):
+        def reward(self, imagination, reward_head):
+            # With a gradient only where there is one to follow; "reinforce" must not need it.
+            chosen = imagination.action[..., 0]
+            return chosen if gradient == "dynamics" else chosen.detach()
+
+    its.reward_source = FirstClass()
+    state = infer(agent.world_model, batch).state.detach()
+    its.actor_optimizer.set_learning_rate(3e-3)
+    rewards = [its._update_behavior(state, batch.is_terminal)["imagined_reward"].item() for _ in range(100)]
+    # Three of four imagined states follow a choice.
+    assert np.mean(rewards[:10]) < 0.5 and np.mean(rewards[-10:]) > 0.7
+
+
+@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
+def test_nothing_is_learnt_from_choices_after_the_end(world_model, batch, gradient):
+    """A dream that begins in a terminal state: its choices weigh nothing, its value is its reward."""
+    agent = Agent(world_model(discount_head=True), [8], None, classes=(2,))
+    config = {**LEARNER, "actor_gradient": gradient, "critic_learning_rate": 0.0, "ent_coef": 0.1}
+    its = Learner(agent, LearnerConfig(**config))
+    state = infer(agent.world_model, batch).state.detach()
+    norm = {
+        ended: its._update_behavior(state, th.full_like(batch.is_terminal, ended))["actor_grad_norm"].item()
+        for ended in (True, False)
+    }
+    assert norm[True] == 0 and norm[False] > 0
 
 
 def test_entropy_bonus_widens_the_actor(learner, batch):
@@ -192,9 +256,13 @@ def test_intrinsic_module_learns_from_the_pass_before_the_model_step(learner, ba
     assert th.allclose(metrics["intrinsic_loss"], loss)
 
 
-@pytest.mark.parametrize("intrinsic", [None, "lbs"])
-def test_an_update_never_asks_the_device_for_a_value(learner, batch, monkeypatch, intrinsic):
-    its = learner(intrinsic, discount_head=True)
+@pytest.mark.parametrize("kind", [None, "lbs", "choices"])
+def test_an_update_never_asks_the_device_for_a_value(learner, world_model, batch, monkeypatch, kind):
+    if kind == "choices":
+        agent = Agent(world_model(discount_head=True), [8], None, classes=(2,))
+        its = Learner(agent, LearnerConfig(**LEARNER, actor_gradient="reinforce"))
+    else:
+        its = learner(kind, discount_head=True)
     its.update(batch)  # anything that torch sets up once
 
     def refuse(*_, **__):

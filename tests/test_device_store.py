@@ -59,7 +59,7 @@ def parts(batch):
     return {n: None if p is None else (p.dtype, p.shape, p.cpu().numpy().tobytes()) for n, p in found.items()}
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"image": DICT, "skill_size": 4}])
+@pytest.mark.parametrize("kwargs", [{}, {"image": DICT, "skill_size": 4}, {"sampling": "rows", "size": 600}])
 def test_all_stores_hold_and_draw_the_same(store, kwargs):  # noqa: F811
     expected, mine = filled(make_buffer(**kwargs)), filled(make_buffer(**kwargs, **store))
     for round_, size in enumerate((40, 40, 40, 7, 40, 40)):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import gymnasium
@@ -11,29 +15,50 @@ import pytest
 from fake_envs import CounterEnv
 from gymnasium import spaces
 
-from sb3_dreamer_urlb import dreamer_v2, envs
+import sb3_dreamer_urlb
+from sb3_dreamer_urlb import dreamer_v2, envs, planning
 from sb3_dreamer_urlb.envs import supervisor
+from sb3_dreamer_urlb.intrinsic import registry
 from sb3_dreamer_urlb.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
-# What makes an example small: the paper's numbers of frames and steps.
-SMALL = {"2_000_000": "480", "2000000": "480", "1_050_000": "360", "50_000": "120", "n_eval_episodes=10": "n_eval_episodes=1"}
+OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]
+PAGES = [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
+HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
+# What makes an example small: numbers of frames and steps.
+SMALL = {
+    "2_000_000": "480",
+    "2000000": "480",
+    "1_060_000": "400",
+    "1_050_000": "360",
+    "500_000": "240",
+    "50_000": "120",
+    "20_000": "480",
+    "10_000": "240",
+    "5_000": "120",
+    "1_000": "120",
+    "episodes=10": "episodes=1",
+}
 
 
-def code_blocks(name: str) -> list[str]:
+def code_blocks(page: str | Path) -> list[str]:
     """The Python blocks of a page, in their order."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
 
 
 @pytest.fixture
 def small_world(monkeypatch, tmp_path):
-    """A cheap walker, the smallest networks, an empty folder."""
+    """A cheap walker for the benchmark's tasks, the smallest networks, an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(PRESETS, "paper", PRESETS["tiny"])
-    asked = []
+    for name in PRESETS:
+        monkeypatch.setitem(PRESETS, name, PRESETS["tiny"])
+    monkeypatch.setattr(registry, "_REGISTRY", registry.registered_intrinsic_rewards())
+    asked, really_make = [], gymnasium.make
 
     def make(name, **kwargs):
         asked.append(name)
+        if not re.fullmatch(r"urlb/(walker|quadruped|jaco)-\w+-v0", name):
+            return really_make(name, **kwargs)
         return CounterEnv(60, action_space=spaces.Box(-1, 1, (6,), np.float32), domain="walker", action_repeat=2)
 
     monkeypatch.setattr(gymnasium, "make", make)
@@ -44,6 +69,7 @@ def run(block: str, names: dict) -> dict:
     """Execute a block at small size."""
     for large, small in SMALL.items():
         block = block.replace(large, small)
+    assert (left := re.search(r"\d_\d{3}", block)) is None, f"{left[0]} is not made small"
     exec(compile(block, "example", "exec"), names)
     return names
 
@@ -79,26 +105,105 @@ def test_guards_and_a_replay_on_disk(small_world, tmp_path, monkeypatch):
     assert model.replay_buffer.can_sample() and (tmp_path / "runs" / "walker-replay" / "finetuning" / "data.mdb").exists()
 
 
-def test_an_intrinsic_reward_of_ones_own(small_world):
-    [block] = [block for block in code_blocks("docs/methods.md") if "register_intrinsic_reward" in block]
-    model = run(block, {"env": gymnasium.make("walker")})["model"]
-    before = model.policy.agent.intrinsic.error.out.weight.clone()
-    model.learn(100)
-    assert model.phase_updates > 0 and not before.equal(model.policy.agent.intrinsic.error.out.weight)
-    assert "intrinsic_reward" in model._metrics.sums
-    assert model.policy.agent.intrinsic.gain == 2.0
-    model.save("own")
-    assert dreamer_v2.DreamerV2.load("own").policy.agent.intrinsic is not None
+@pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
+def test_howto(small_world, tmp_path, page):
+    blocks = code_blocks(page)
+    assert blocks
+    names = {"__name__": "howto"}
+    for block in blocks:
+        run(block, names)
+    if page.stem in AFTERWARDS:
+        AFTERWARDS[page.stem](names, tmp_path)
+
+
+def after_environment(names, folder):
+    assert names["model"].num_timesteps == 240 and names["model"]._n_updates > 0
+    assert names["env"].unwrapped.domain == "cheetah"
+
+
+def after_finetune(names, folder):
+    assert all((folder / f"walker-{task}.zip").exists() for task in ("walk", "run", "flip"))
+    assert (folder / "snapshots" / "snapshot_240.zip").exists()
+    assert names["model"].phase == "finetuning" and names["model"]._n_updates > 0
+
+
+def after_intrinsic_reward(names, folder):
+    model = dreamer_v2.DreamerV2.load("own")
+    assert isinstance(model.policy.agent.intrinsic, names["EmbeddingError"]) and model.policy.agent.intrinsic.gain == 2.0
+    fresh = dreamer_v2.DreamerV2("CnnPolicy", names["env"], intrinsic_reward="embedding_error", seed=model.seed)
+    weight = [m.policy.agent.intrinsic.error.out.weight for m in (model, fresh)]
+    assert model.phase_updates > 0 and not weight[0].equal(weight[1])
+    assert "intrinsic_reward" in names["model"]._metrics.sums
+
+
+def after_evaluate(names, folder):
+    # CounterEnv's 60 steps, whoever acts.
+    assert names["mean"] == names["total"] == names["returns"][0] == names["random_returns"][0] == 30
+    assert names["score"] == pytest.approx(30 / 909)
+    assert len(names["truth"]) == 50 and (folder / "open_loop.gif").exists() and (folder / "best").exists()
+    assert names["actor"].planner is None and names["model"].phase == "finetuning"
+
+
+def after_resume(names, folder):
+    assert (folder / "runs" / "walker" / "snapshot.zip").exists()
+    assert names["model"].num_timesteps == 240
+
+
+def after_share(names, folder):
+    assert (folder / "walker.zip").exists() and names["model"].learning_rate == 3e-4
+    assert names["action"].shape == (6,)
+
+
+AFTERWARDS = {name.removeprefix("after_"): check for name, check in list(globals().items()) if name.startswith("after_")}
 
 
 def test_cartpole(monkeypatch):
     monkeypatch.setitem(PRESETS, "vector", PRESETS["tiny"])
     [block] = code_blocks("docs/sb3.md")
-    model = run(block.replace("10_000", "200").replace("batch_length=8", "batch_length=4"), {})["model"]
+    model = run(block.replace("20_000", "200"), {})["model"]
     assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
 
 
 def test_every_local_link_leads_somewhere():
-    for page in (ROOT / "README.md", ROOT / "SECURITY.md", *(ROOT / "docs").glob("*.md")):
+    for page in PAGES:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_site(tmp_path):
+    """The documentation as ``make docs`` builds it: a page outside the navigation, a broken link or anchor fails."""
+    pytest.importorskip("mkdocstrings", reason="needs the extra docs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path]
+    made = subprocess.run(command, cwd=ROOT, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True)
+    assert made.returncode == 0 and "WARNING" not in made.stderr, made.stderr
+    # One test: building takes seconds.
+    every_public_name_has_its_place(tmp_path)
+    docstrings_look_as_they_are_meant(tmp_path)
+    pages_and_code_come_from_outside_of_docs(tmp_path)
+
+
+def every_public_name_has_its_place(site):
+    # Sphinx's inventory: four lines, then compressed ones, each beginning with a name.
+    inventory = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
+    documented = {line.split(" ")[0] for line in inventory.splitlines()}
+    for module in (sb3_dreamer_urlb, envs, planning):
+        assert not {f"{module.__name__}.{name}" for name in module.__all__} - documented
+    methods = ("learn", "predict", "save", "load", "resume", "fine_tune")
+    assert not {f"sb3_dreamer_urlb.DreamerV2.{name}" for name in methods} - documented
+
+
+def docstrings_look_as_they_are_meant(site):
+    pages = {page.parent.name: page.read_text() for page in (site / "api").rglob("*.html")}
+    for name, page in pages.items():
+        shown = re.sub(r"<details.*?</details>", "", page, flags=re.DOTALL)  # source code
+        assert not re.findall(r":(?:param|raises|return|class|meth|func)\b", shown), name
+    assert "#sb3_dreamer_urlb.PhaseSwitchCallback" in pages["algorithm"]  # :class: became a link
+    assert "Environment frames seen in the phase" in pages["algorithm"]  # a #: comment became a description
+
+
+def pages_and_code_come_from_outside_of_docs(site):
+    start = (site / "index.html").read_text()
+    assert 'href="concepts/"' in start and 'src="images/learning_curve.png"' in start
+    code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
+    assert "class LBS" in re.sub(r"<[^>]*>", "", code)
+    assert "PRETRAIN_FRAMES" in (site / "quickstart/index.html").read_text()

@@ -174,6 +174,68 @@ def test_whatever_the_lengths(lengths, n_envs, batch_length, buffer_size, steps)
     assert set(decode(batch)[0].flatten().tolist()) <= {e for e, *_ in expected}
 
 
+def check_rows_in_a_row(batch, expected):
+    """Each row carries what led to it; where an episode ends, the first row of the next one follows, marked."""
+    rows_of = {e: rows for e, rows, _ in expected}
+    order = [e for e, *_ in reversed(expected)]
+    following = dict(zip(order, order[1:] + order[:1], strict=True))
+    episode, t = decode(batch)
+    is_first = batch.is_first.numpy()
+    assert is_first[:, 0].all() and np.array_equal(is_first[:, 1:], t[:, 1:] == 0)
+    for e, s in zip(episode, t, strict=True):
+        for i in range(1, len(e)):
+            last = s[i - 1] == rows_of[e[i - 1]] - 1
+            assert (e[i], s[i]) == ((following[e[i - 1]], 0) if last else (e[i - 1], s[i - 1] + 1))
+    ends = {e: (rows - 1, end) for e, rows, end in expected}
+    terminal = [[ends[e] == (s, "terminal") for e, s in zip(*row, strict=True)] for row in zip(episode, t, strict=True)]
+    assert np.array_equal(batch.is_terminal.numpy(), terminal)
+    led = t > 0
+    assert np.array_equal(batch.action.numpy(), np.where(led[..., None], np.stack([episode, t], -1), 0))
+    assert np.allclose(batch.reward.numpy(), np.where(led, episode + t / 1000, 0), atol=1e-3)
+
+
+def test_sampling_by_rows(store):
+    """Short episodes are kept, sequences run on into the next one, and no row is rarer than another, last ones included."""
+    buffer = make_buffer(300, n_envs=1, sampling="rows", **store)
+    streams = Streams(buffer, lambda e: ((1, 40, 12, 3, 25)[e % 5], "terminal" if e % 3 else "truncated"))
+    while len(streams.finished) < 40:
+        streams.step()
+    expected, rows = [], 0
+    for episode in reversed(streams.finished):
+        if rows + episode[1] > 300:
+            break
+        expected.append(episode)
+        rows += episode[1]
+    assert rows == buffer.finished_rows and min(length for _, length, _ in expected) < buffer.batch_length
+    draws: Counter[tuple[int, int]] = Counter()
+    for _ in range(50):
+        batch = buffer.sample(20)
+        buffer.prefetch(20)
+        check_rows_in_a_row(batch, expected)
+        episode, t = decode(batch)
+        draws.update(zip(episode.flatten().tolist(), t.flatten().tolist(), strict=True))
+    assert set(draws) == {(e, t) for e, length, _ in expected for t in range(length)}
+    # 33 of each on average; the ten rows of a sequence are drawn together.
+    by_last = np.mean([draws[e, length - 1] for e, length, _ in expected])
+    assert abs(by_last / (10_000 / rows) - 1) < 0.25
+    assert abs(np.mean([draws[e, 0] for e, *_ in expected]) / (10_000 / rows) - 1) < 0.25
+
+
+def test_sampling_by_rows_needs_enough_rows_in_all():
+    buffer = make_buffer(n_envs=1, sampling="rows")
+    streams = Streams(buffer, lambda _: (2, "terminal"))
+    for episodes in range(1, 6):
+        for _ in range(2):
+            streams.step()
+        assert buffer.finished_rows == 3 * episodes and buffer.can_sample() == (3 * episodes >= 10)
+    check_rows_in_a_row(buffer.sample(50), streams.finished[::-1])
+
+
+def test_an_unknown_sampling_is_refused():
+    with pytest.raises(ValueError, match=r"sampling must be one of \('episodes', 'rows'\), got 'uniform'"):
+        make_buffer(sampling="uniform")
+
+
 def test_types_and_shapes_of_a_batch():
     streams = Streams(make_buffer(), lambda _: (20, "truncated"))
     for _ in range(20):

@@ -196,6 +196,21 @@ def test_loss_is_the_sum_of_its_parts(world_model, batch):
     assert not any(value.requires_grad for value in metrics.values())
 
 
+def test_weight_of_the_kl(world_model, batch):
+    model = world_model(discount_head=True)
+    with golden.deterministic_draws():
+        posterior = infer(model, batch)
+        image = model.preprocess(batch.observation)
+
+        def loss(*scale):
+            return model.loss(posterior, image, batch.reward, batch.is_terminal, 0.0, 0.8, True, *scale)
+
+        plain, metrics = loss()
+        weighed, same = loss(0.1)
+    assert th.allclose(weighed, plain - 0.9 * metrics["kl_loss"], rtol=1e-5)
+    assert same == metrics  # they tell the loss, not its weight
+
+
 @pytest.mark.parametrize("trains", [True, False])
 def test_rewards_reach_the_model_only_if_they_may(world_model, batch, trains):
     model = world_model()
@@ -217,7 +232,11 @@ def test_discount(world_model):
     feature = th.randn(4, 5, model.sizes.feature)
     assert th.equal(model.discount(feature), th.full((4, 5), 0.99))
     model = world_model(discount_head=True)
-    assert th.allclose(model.discount(feature), 0.99 * model.discount_logit(feature).sigmoid())
+    guessed = 0.99 * model.discount_logit(feature).sigmoid()
+    assert th.allclose(model.discount(feature), guessed)
+    # Where the dreams begin, the replay knows.
+    known = model.discount(feature, th.tensor([1.0, 0.0, 1.0, 0.0, 0.0]))
+    assert th.allclose(known[0], th.tensor([0.99, 0.0, 0.99, 0.0, 0.0])) and th.allclose(known[1:], guessed[1:])
 
 
 def test_discount_head_learns_which_states_terminate(learner, batch):

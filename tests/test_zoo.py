@@ -33,6 +33,7 @@ CONFIGS = ROOT / "zoo_configs"
 METHODS = ("lbs", "plan2explore", "icm", "rnd", "apt", "diayn", "aps", "random")
 OTHERS = ("scratch", "finetune")
 FILES = [f"{folder}{name}.yml" for folder in ("", "small/") for name in (*METHODS, *OTHERS)]
+VECTORS = "vectors.yml"
 STAND, FLIP = "urlb/walker-stand-v0", "urlb/walker-flip-v0"
 
 
@@ -54,7 +55,7 @@ def leaves(value):
 
 
 def test_there_are_no_other_files():
-    assert sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*")) == sorted(FILES)
+    assert sorted(path.relative_to(CONFIGS).as_posix() for path in CONFIGS.rglob("*.*")) == sorted([*FILES, VECTORS])
 
 
 @pytest.mark.parametrize("file", FILES)
@@ -115,6 +116,20 @@ def test_the_constructors_take_what_every_file_says(file, monkeypatch):
         assert len(callbacks) == {"scratch": 0, "finetune": 1}.get(Path(file).stem, 2)
         with pytest.raises(TypeError, match="pretrain_frames"):
             DreamerV2(env=CounterEnv(), device="cpu", pretrain_frames=3, **arguments)
+
+
+def test_the_file_for_vectors():
+    """Both tasks at full size: what the file says is what the constructor takes."""
+    read = entries(VECTORS)
+    assert sorted(read) == ["CartPole-v1", "Pendulum-v1"]
+    for task, entry in read.items():
+        entry = dict(entry)
+        assert entry.pop("n_timesteps") <= 50_000 and entry.pop("normalize") is True and entry["preset"] == "vector"
+        for value in leaves(entry):
+            assert not (isinstance(value, str) and re.fullmatch(r"[-+\d.eE]+", value)), value
+        model = DreamerV2(env=gymnasium.make(task), device="cpu", **entry)
+        assert model.replay_buffer.sampling == "rows" and model.replay_buffer.can_sample() is False
+        assert model.learner.config.actor_gradient == {"CartPole-v1": "reinforce", "Pendulum-v1": "dynamics"}[task]
 
 
 def test_the_page_names_what_exists():
@@ -219,6 +234,14 @@ def test_rl_zoo3_itself_in_the_repository(tmp_path):
     assert (model.phase, model.phase_timesteps, model.observation_space.shape) == ("pretraining", 8, (3, 64, 64))
 
 
+@pytest.mark.parametrize("task", ["CartPole-v1", "Pendulum-v1"])
+def test_tasks_seen_as_vectors_find_their_file(zoo, task, capsys):
+    zoo(*TRAIN, "--env", task, "-n", "30", "--eval-freq", "-1", "-params", "preset:'tiny'", "train_freq:5")
+    assert VECTORS in capsys.readouterr().out
+    folder = latest_run(task)
+    assert (folder / task / "vecnormalize.pkl").is_file() and model_in(folder, task).phase_timesteps == 30
+
+
 def test_one_run_through_both_phases_with_all_savers(zoo, capsys):
     savers = ["--eval-freq", "30", "--eval-episodes", "1", "--save-freq", "20", "--save-replay-buffer"]
     run = train(zoo, STAND, 60, "lbs", *savers, params=TINY)
@@ -268,7 +291,7 @@ def test_mistakes_are_named(zoo, monkeypatch):
         train(zoo, STAND, 8, "scratch", "-i", f"{run}/urlb-walker-stand-v0.zip")
     with pytest.raises(ValueError, match="FineTuneCallback needs a pre-trained model"):
         train(zoo, FLIP, 8, "finetune", params=TINY[:1])
-    monkeypatch.setattr("sb3_dreamer_urlb.zoo.registration.DEFAULT_CONFIG", Path("nowhere.yml"))
+    monkeypatch.setattr("sb3_dreamer_urlb.zoo.registration.DEFAULT_CONFIGS", [Path("nowhere.yml")])
     with pytest.raises(ValueError, match="Name a configuration with -conf"):
         zoo(*TRAIN, "--env", STAND)
     with pytest.raises(SystemExit):

@@ -14,6 +14,9 @@ from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import Imagination, Metrics
 
 MIN_STD = 0.1
+#: where the actor's gradient comes from: through the model's dynamics, or by the score function (REINFORCE)
+DYNAMICS, REINFORCE = ACTOR_GRADIENTS = ("dynamics", "reinforce")
+AUTO = "auto"
 
 
 class Actor(nn.Module):
@@ -39,7 +42,7 @@ class Actor(nn.Module):
 
 
 class CategoricalActor(MLP):
-    """π(a | z) over choices among classes: one-hot actions with straight-through gradients (DreamerV2).
+    """π(a | z) over choices among classes: one-hot actions whose samples carry straight-through gradients (DreamerV2).
 
     :param feature_size: F
     :param classes: number of classes of each choice
@@ -127,6 +130,17 @@ class RewardNormalizer(nn.Module):
         return reward / (self.scale.clone() + 1e-8)
 
 
+def choose_gradient(actor_gradient: str, classes: Sequence[int]) -> str:
+    """What ``"auto"`` means: as DreamerV2, the dynamics for numbers, REINFORCE for choices.
+
+    :param actor_gradient: one of ``ACTOR_GRADIENTS``, or ``AUTO``
+    :param classes: number of classes of each choice that is an action; empty where actions are numbers
+    """
+    if actor_gradient != AUTO:
+        return actor_gradient
+    return REINFORCE if classes else DYNAMICS
+
+
 def with_entropy_bonus(returns: th.Tensor, entropy: th.Tensor, ent_coef: float) -> th.Tensor:
     """What actor and critic aim at: λ-returns, from z_1 on with the entropy of the choice that led there.
 
@@ -147,6 +161,24 @@ def actor_loss(target: th.Tensor, weight: th.Tensor) -> th.Tensor:
     :param weight: of z_0 … z_{H-1}, float (H, N)
     """
     return -(weight[:-1] * target[1:]).mean()
+
+
+def reinforce_loss(
+    target: th.Tensor, value: th.Tensor, weight: th.Tensor, log_prob: th.Tensor, entropy: th.Tensor, ent_coef: float
+) -> th.Tensor:
+    """− mean(weight · (log π(a) · (target of the next state − value of this one) + ent_coef · entropy)) (DreamerV2's Atari).
+
+    The model passes no gradient on: with one-hot actions and one-hot states it would be straight-through all the way.
+
+    :param target: of z_0 … z_{H-1}, float (H, N); taken as constants
+    :param value: the slow critic's, of z_0 … z_H, float (H + 1, N); the baseline, taken as constants
+    :param weight: of z_0 … z_{H-1}, float (H, N)
+    :param log_prob: of the actions chosen in z_0 … z_{H-1}, with gradients to the actor, float (H, N)
+    :param entropy: of the actor there, with gradients, float (H, N)
+    :param ent_coef: weight of the entropy
+    """
+    advantage = (target[1:] - value[:-2]).detach()
+    return -(weight[:-1] * (log_prob[:-1] * advantage + ent_coef * entropy[:-1])).mean()
 
 
 def discount_weights(discount: th.Tensor) -> th.Tensor:

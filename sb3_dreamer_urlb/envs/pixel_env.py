@@ -135,7 +135,7 @@ class PixelControlEnv(gymnasium.Env[npt.NDArray[np.uint8], npt.NDArray[np.float3
         reward = 0.0 if self._options.reward_free else task_reward
         return observation, reward, terminated, truncated, {"task_reward": task_reward}
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """The present state, drawn for people: of ``render_size``, whatever the size of the observations.
 
         :return: uint8 (render_size, render_size, 3), or None without a render mode

@@ -113,7 +113,7 @@ class SupervisedVecEnv(VecEnv):
     def _result(self, i: int) -> tuple[Any, ...]:
         if i not in self._lost:
             try:
-                result = self.workers[i].receive()
+                result: tuple[Any, ...] = self.workers[i].receive()
                 if FAULT in result[3]:
                     self.counters[i].steps += 1
                 else:

@@ -17,7 +17,7 @@ class RandomPolicy:
     :param seed: of the draws
     """
 
-    def __init__(self, action_space: gymnasium.Space, seed: int = 0):
+    def __init__(self, action_space: gymnasium.Space[Any], seed: int = 0):
         self.action_space = action_space
         self.action_space.seed(seed)
 

@@ -18,6 +18,28 @@ from sb3_dreamer_urlb.intrinsic.rnd import RND
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.intrinsic.skills import OneHotSkills, Skills, UnitSkills
 
+__all__ = [
+    "APS",
+    "APT",
+    "DIAYN",
+    "ICM",
+    "LBS",
+    "RND",
+    "IntrinsicReward",
+    "OneHotSkills",
+    "Plan2Explore",
+    "RandomActions",
+    "RewardHead",
+    "RewardSource",
+    "SkillReward",
+    "Skills",
+    "UnitSkills",
+    "get_intrinsic_reward",
+    "make_intrinsic_reward",
+    "register_intrinsic_reward",
+    "registered_intrinsic_rewards",
+]
+
 register_intrinsic_reward("icm", ICM)
 register_intrinsic_reward("plan2explore", Plan2Explore)
 register_intrinsic_reward("rnd", RND)

@@ -63,7 +63,7 @@ class IntrinsicReward(RewardSource):
     - :meth:`reward`: where the reward can be computed in imagination, or
     - :meth:`replay_reward`: where it needs real observations; the world model's reward head then learns it.
 
-    What snapshots must hold is a parameter or a buffer. See docs/methods.md for an example.
+    What snapshots must hold is a parameter or a buffer. See docs/howto/intrinsic_reward.md for an example.
     """
 
     momentum: ClassVar[float] = 0.95

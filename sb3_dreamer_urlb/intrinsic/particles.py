@@ -52,7 +52,7 @@ def knn_distances(particles: th.Tensor, k: int, chunk_size: int | None = None) -
         chunk_size = max(1, numbers // max(n, d * (k + _SPARE)))
     if chunk_size < 1:
         raise ValueError(f"chunk_size must be at least 1, not {chunk_size}.")
-    return _KNNDistances.apply(particles, k, chunk_size)
+    return _KNNDistances.apply(particles, k, chunk_size)  # type: ignore[no-untyped-call]
 
 
 class _KNNDistances(Function):

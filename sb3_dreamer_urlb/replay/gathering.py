@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import torch as th
 
-#: an episode, and the first row of a sequence in it
-Draw = tuple[Any, int]
+#: the pieces of one sequence, one after the other: an episode, first row, row after the last
+Draw = list[tuple[Any, int, int]]
+#: column of a batch that episodes do not have: where the pieces begin
+IS_FIRST = "is_first"
 #: columns of a batch by name, (B, T, …) each
 Arrays = dict[str, np.ndarray]
 Tensors = dict[str, th.Tensor]
@@ -23,27 +25,53 @@ def on_host(
     :param draws: B of them
     :param length: T, rows of each
     :param new: makes an array of a name, a shape and a dtype, for it to be filled; None for ordinary ones
-    :return: (B, T, …) by name
+    :return: (B, T, …) by name, ``IS_FIRST`` among them
     """
     columns: Arrays = {}
-    for b, (episode, start) in enumerate(draws):
-        for name, rows in episode.rows(start, start + length).items():
-            if b == 0:
-                shape = (len(draws), *rows.shape)
-                columns[name] = np.empty(shape, rows.dtype) if new is None else new(name, shape, rows.dtype)
-            columns[name][b] = rows
+
+    def column(name: str, rows: np.ndarray) -> np.ndarray:
+        if name not in columns:
+            shape = (len(draws), length, *rows.shape[1:])
+            columns[name] = np.empty(shape, rows.dtype) if new is None else new(name, shape, rows.dtype)
+        return columns[name]
+
+    for b, pieces in enumerate(draws):
+        t = 0
+        for episode, start, stop in pieces:
+            for name, rows in episode.rows(start, stop).items():
+                column(name, rows)[b, t : t + len(rows)] = rows
+            t += stop - start
+    column(IS_FIRST, np.empty(0, bool))[:] = _first_rows(draws, length)
     return columns
 
 
+def _first_rows(draws: Sequence[Draw], length: int) -> np.ndarray:
+    """Where the pieces of sequences begin, bool (B, T)."""
+    is_first = np.zeros((len(draws), length), bool)
+    for row, pieces in zip(is_first, draws, strict=True):
+        t = 0
+        for _, start, stop in pieces:
+            row[t] = True
+            t += stop - start
+    return is_first
+
+
 def on_device(draws: Sequence[Draw], length: int) -> Tensors:
-    """Copy sequences of episodes on a device into tensors there; nothing waits, nothing crosses the bus.
+    """Copy sequences of episodes on a device into tensors there; nothing waits, no frame crosses the bus.
 
     :param draws: B of them, of :class:`~sb3_dreamer_urlb.replay.device_store.DeviceEpisode`
     :param length: T, rows of each
-    :return: (B, T, …) by name
+    :return: (B, T, …) by name, ``IS_FIRST`` among them
     """
-    parts = [episode.part(start, start + length) for episode, start in draws]
-    return {name: th.stack([part[name] for part in parts]) for name in parts[0]}
+    parts = [episode.part(start, stop) for pieces in draws for episode, start, stop in pieces]
+    columns = {name: th.cat([part[name] for part in parts]).unflatten(0, (len(draws), length)) for name in parts[0]}
+    device = parts[0]["reward"].device
+    if len(parts) > len(draws):
+        columns[IS_FIRST] = th.from_numpy(_first_rows(draws, length)).to(device, non_blocking=True)
+    else:
+        columns[IS_FIRST] = th.zeros((len(draws), length), dtype=th.bool, device=device)
+        columns[IS_FIRST][:, 0] = True
+    return columns
 
 
 class Transfer:

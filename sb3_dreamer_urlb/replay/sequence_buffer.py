@@ -1,7 +1,8 @@
 """Replay of whole episodes, drawn as sequences (spec/algorithms §3, spec/reliability "Replay").
 
 Row t of an episode holds observation t with the action and the reward that *led to* it. Each environment writes its own
-stream, so episodes may end at different times; only finished episodes are drawn, and a sequence never leaves its episode.
+stream, so episodes may end at different times; only finished episodes are drawn. A sequence never leaves its episode, unless
+``sampling="rows"`` says so.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
 from sb3_dreamer_urlb.replay.episode import Episode, RawObservation, observation_columns, observation_of
 from sb3_dreamer_urlb.replay.prefetch import Prefetcher
+from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, check_sampling, draw
 from sb3_dreamer_urlb.types import SequenceBatch
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.replay.lmdb_store import LmdbStore
 
 
-def _zeros(space: spaces.Space) -> np.ndarray:
+def _zeros(space: spaces.Space[Any]) -> np.ndarray:
     assert space.shape is not None
     return np.zeros(space.shape, space.dtype)
 
@@ -60,6 +62,10 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
     :param prefetch: let a thread gather the next batch and bring it to the device while something else goes on
         (:meth:`prefetch`); None does so on CUDA. Not for ``store="device"``, which has nothing to bring
+    :param sampling: ``"episodes"`` draws an episode uniformly, then a start uniformly, and leaves out episodes shorter than
+        a sequence (the paper); ``"rows"`` draws the start from all rows uniformly, and goes on with the next episode's first
+        row where one ends before the sequence does. For tasks that terminate: short episodes are kept and weigh no more
+        than they are long, and last rows, which show how episodes end, come as often as any other
     :raises ValueError: for arguments that do not fit
     :raises ModuleNotFoundError: if lmdb is not installed
     """
@@ -67,8 +73,8 @@ class SequenceReplayBuffer(ReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Space,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
         device: th.device | str = "auto",
         n_envs: int = 1,
         *,
@@ -81,6 +87,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         path: str | os.PathLike[str] | None = None,
         map_size: int | None = None,
         prefetch: bool | None = None,
+        sampling: str = BY_EPISODE,
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
@@ -93,6 +100,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.batch_length = batch_length
         # A piece must fit into the buffer, or it would be all that is ever held.
         self.max_episode_rows = min(max_episode_rows, buffer_size)
+        check_sampling(sampling)
+        self.sampling = sampling
         self.phase = phase
         self.skill_size = skill_size
         self.rng = np.random.default_rng(seed)
@@ -176,7 +185,7 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def add(  # type: ignore[override]
+    def add(
         self,
         obs: RawObservation,
         next_obs: RawObservation,
@@ -233,7 +242,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             return
         self.finished_count += 1
         self.longest = max(self.longest, len(episode))
-        if len(episode) < self.batch_length:
+        if self.sampling == BY_EPISODE and len(episode) < self.batch_length:
             return
         self._prefetcher.discard()
         if self.disk is None:
@@ -245,7 +254,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     def hold(self, episodes: Iterable[Episode]) -> None:
         """Take finished episodes in, not on disk.
 
-        :param episodes: of at least ``batch_length`` rows
+        :param episodes: long enough to be drawn
         :raises MemoryError: if the device has no memory for them
         """
         for episode in episodes:
@@ -278,28 +287,26 @@ class SequenceReplayBuffer(ReplayBuffer):
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def can_sample(self) -> bool:
-        """Whether any finished episode is long enough."""
+        """Whether any finished episode is long enough, or all of them together if sequences may run through several."""
         self.attach()
-        return len(self.episodes) > 0
+        return len(self.episodes) > 0 and self.finished_rows >= self.batch_length
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceBatch:  # type: ignore[override]
-        """Draw sequences: an episode uniformly, then a start uniformly (spec/algorithms §3).
+        """Draw sequences, as ``sampling`` says.
 
         :param batch_size: B
         :param env: normalises observations and rewards if given
         :return: (B, T, …) on ``device``
-        :raises ValueError: if no finished episode has ``batch_length`` rows
+        :raises ValueError: if finished episodes have not the rows for it
         """
         if not self.can_sample():
             raise ValueError(f"No finished episode has batch_length={self.batch_length} rows yet.")
         columns = self._drawn(batch_size) if env is None else self._drawn_and_normalized(batch_size, env)
-        is_first = th.zeros((batch_size, self.batch_length), dtype=th.bool, device=self.device)
-        is_first[:, 0] = True
         return SequenceBatch(
             observation_of(columns),
             columns["action"],
             columns["reward"],
-            is_first,
+            columns[gathering.IS_FIRST],
             columns["is_terminal"],
             columns["skill"] if self.skill_size else None,
         )
@@ -326,12 +333,9 @@ class SequenceReplayBuffer(ReplayBuffer):
         return {name: self._tensor(rows) for name, rows in columns.items()}
 
     def _draws(self, rng: np.random.Generator, batch_size: int) -> list[gathering.Draw]:
-        """Which sequences: episodes and first rows."""
-        found = []
-        for index in rng.integers(len(self.episodes), size=batch_size):
-            episode = self.episodes[index]
-            found.append((episode, int(rng.integers(len(episode) - self.batch_length + 1))))
-        return found
+        """Which rows make the sequences."""
+        places = draw(self.sampling, rng, self.episodes, self.batch_length, batch_size)
+        return [[(self.episodes[index], start, stop) for index, start, stop in pieces] for pieces in places]
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device, non_blocking=True)

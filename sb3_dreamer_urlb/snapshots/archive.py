@@ -141,7 +141,7 @@ class Archive:
 
     def size(self, member: str) -> int:
         """Of a member, in bytes."""
-        return self._members[member]["size"]
+        return int(self._members[member]["size"])
 
     def head(self, member: str, count: int) -> bytes:
         """The first ``count`` bytes of a member."""

@@ -203,7 +203,7 @@ def _blank(
         )
     # The stored arguments are complete: the preset must not fill anything in.
     preset = decoded.pop("preset", "paper")
-    model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})  # type: ignore[arg-type]
+    model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
     model.preset = preset
     return model
 

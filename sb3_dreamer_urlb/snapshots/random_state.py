@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 def generator_state(generator: np.random.Generator) -> dict[str, Any]:
     """Of numpy's own kind of generator, as JSON."""
-    return _plain(dict(generator.bit_generator.state))
+    state: dict[str, Any] = _plain(dict(generator.bit_generator.state))
+    return state
 
 
 def _plain(value: Any) -> Any:

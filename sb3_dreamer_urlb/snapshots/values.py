@@ -151,7 +151,7 @@ def _box_fields(space: spaces.Box) -> tuple[str, dict[str, Any]]:
 
 def _box(low: Any, high: Any, shape: list[int], dtype: str) -> spaces.Box:
     full = [np.broadcast_to(np.asarray(bound, dtype), _shape(shape)) for bound in (low, high)]
-    return spaces.Box(full[0], full[1], tuple(shape), dtype=np.dtype(dtype).type)  # type: ignore[arg-type]
+    return spaces.Box(full[0], full[1], tuple(shape), dtype=np.dtype(dtype).type)
 
 
 def _discrete(n: int, start: int, dtype: str = "int64") -> spaces.Discrete:

@@ -44,7 +44,7 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     # Outside of the function, so that autograd brings the gradients back to float32.
     x, weight, bias = x.to(dtype), layer.weight.to(dtype), layer.bias.to(dtype)
     with th.autocast("cpu", enabled=False):
-        return _Convolution.apply(x, weight, bias, stride, transposed)
+        return _Convolution.apply(x, weight, bias, stride, transposed)  # type: ignore[no-untyped-call]
 
 
 class _Convolution(Function):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -67,7 +68,7 @@ class Images(Observations):
     :raises UnsupportedSpaceError: if it is something else, or has a size the networks do not take
     """
 
-    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+    def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Box) or not is_image_space(space, normalized_image=not normalize_images):
             raise UnsupportedSpaceError(
                 "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), or floats with "
@@ -134,7 +135,7 @@ class Numbers(Vectors):
     :param normalize_images: divide images
     """
 
-    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+    def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         assert space.shape is not None
         self.shape = space.shape
         self.size = int(np.prod(self.shape))
@@ -153,7 +154,7 @@ class Classes(Vectors):
     :param normalize_images: unused, every kind of vector is made with it
     """
 
-    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+    def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         assert isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and space.shape is not None
         self.shape = space.shape
         self.classes = classes_of(space)
@@ -168,7 +169,7 @@ class Classes(Vectors):
 
 
 #: what each space is to ``MlpPolicy``
-VECTORS: dict[type[spaces.Space], type[Numbers] | type[Classes]] = {
+VECTORS: dict[type[spaces.Space[Any]], type[Numbers] | type[Classes]] = {
     spaces.Box: Numbers,
     spaces.MultiBinary: Numbers,
     spaces.Discrete: Classes,
@@ -176,7 +177,7 @@ VECTORS: dict[type[spaces.Space], type[Numbers] | type[Classes]] = {
 }
 
 
-def vectors(space: spaces.Space, normalize_images: bool = True) -> Vectors:
+def vectors(space: spaces.Space[Any], normalize_images: bool = True) -> Vectors:
     """The kind of an observation space that is flattened.
 
     :param space: of the environment
@@ -198,7 +199,7 @@ class DictObservations(Observations):
     :raises UnsupportedSpaceError: for another space, or if one of its spaces does not fit
     """
 
-    def __init__(self, space: spaces.Space, normalize_images: bool = True):
+    def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Dict) or len(space.spaces) == 0:
             raise UnsupportedSpaceError(f"MultiInputPolicy needs a Dict of observations, got {space}.")
         self.parts: dict[str, Observations] = {}

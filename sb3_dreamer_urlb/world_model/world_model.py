@@ -77,6 +77,7 @@ class WorldModel(nn.Module):
         free_nats: float,
         kl_balance: float,
         reward_trains_model: bool,
+        kl_scale: float = 1.0,
     ) -> tuple[th.Tensor, Metrics]:
         """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
 
@@ -87,13 +88,14 @@ class WorldModel(nn.Module):
         :param free_nats: the KL below which the model is not pushed; applied to the batch mean
         :param kl_balance: share of the KL's gradient that trains the prior
         :param reward_trains_model: False stops the reward head's gradient before the model (pre-training)
+        :param kl_scale: weight of the KL
         :return: loss (scalar) and metrics (detached scalars)
         """
         kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
         seen_losses = self.observations.losses(self.decoder(posterior.feature), observation)
         reward_feature = posterior.feature if reward_trains_model else posterior.feature.detach()
         reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), reward).mean()
-        loss = kl_loss + sum(seen_losses.values()) + reward_nll
+        loss = kl_scale * kl_loss + sum(seen_losses.values()) + reward_nll
         metrics = {"kl_loss": kl_loss, **seen_losses, "reward_loss": reward_nll, "kl": posterior.kl.mean()}
         if self.discount_logit is not None:
             goes_on = (~is_terminal).to(reward.dtype)
@@ -147,8 +149,15 @@ class WorldModel(nn.Module):
             entropies.append(policy.entropy())
         return Imagination(th.stack(features), th.stack(actions), th.stack(entropies), skill)
 
-    def discount(self, feature: th.Tensor) -> th.Tensor:
-        """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…)."""
+    def discount(self, feature: th.Tensor, goes_on: th.Tensor | None = None) -> th.Tensor:
+        """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…).
+
+        :param feature: float (…, F); (H + 1, N, F) of dreams if ``goes_on`` is given
+        :param goes_on: what is known about the states where the dreams begin, 0 or 1, float (N,): needs no guess (DreamerV2)
+        """
         if self.discount_logit is None:
             return th.full_like(feature[..., 0], self.gamma)
-        return self.gamma * th.sigmoid(self.discount_logit(feature))
+        probability = th.sigmoid(self.discount_logit(feature))
+        if goes_on is not None:
+            probability = th.cat([goes_on.unsqueeze(0), probability[1:]])
+        return self.gamma * probability

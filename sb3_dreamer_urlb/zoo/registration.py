@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
@@ -24,8 +25,8 @@ from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dream
 
 #: rl_zoo3's name of the algorithm; the hub looks for the class's name in lower case
 ALGORITHM = "dreamerv2"
-#: what ``train`` reads without ``-conf``, in a checkout of the repository
-DEFAULT_CONFIG = Path(__file__).parents[2] / "zoo_configs" / "lbs.yml"
+#: what ``train`` reads without ``-conf``, in a checkout of the repository: the first of these that knows the environment
+DEFAULT_CONFIGS = [Path(__file__).parents[2] / "zoo_configs" / name for name in ("lbs.yml", "vectors.yml")]
 #: by name, because rl_zoo3 makes one for each trial
 FINITE = f"{FiniteWeightsCallback.__module__}.{FiniteWeightsCallback.__qualname__}"
 
@@ -65,9 +66,12 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     :raises ValueError: if there is no file to read
     """
     if getattr(manager.args, "conf_file", manager.config) is None:
-        if not DEFAULT_CONFIG.is_file():
+        there = [path for path in DEFAULT_CONFIGS if path.is_file()]
+        if not there:
             raise ValueError("Name a configuration with -conf; this package's repository has some in zoo_configs/.")
-        manager.config = str(DEFAULT_CONFIG)
+        knowing = [path for path in there if manager.env_name.gym_id in yaml.safe_load(path.read_text())]
+        # Of an environment that none of them knows, rl_zoo3 complains itself.
+        manager.config = str((knowing or there)[0])
     return original(manager)
 
 

@@ -1,0 +1,86 @@
+"""MkDocs hook: the pages of the site that lie outside of docs/, so that nothing stands twice.
+
+README.md is the start page, changelog, security notes and the notebook are pages, and a Python file that a page links to
+becomes a page with its code. Links are rewritten to fit; whatever leads nowhere is left to MkDocs, which refuses it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parent.parent
+#: file of the repository → its page
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
+    "examples/quickstart.ipynb": "quickstart.md",
+}
+# The target of a Markdown link or image that is neither a URL nor an anchor of the same page.
+LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#\s]+)")
+
+
+def page_of(path: Path) -> str | None:
+    """Where a file of the repository is found on the site; None if it is not there.
+
+    :param path: absolute
+    """
+    if not path.is_relative_to(ROOT) or not path.is_file():
+        return None
+    name = path.relative_to(ROOT).as_posix()
+    if name.startswith("docs/"):
+        return name.removeprefix("docs/")
+    return PAGES.get(name) or (f"source/{name}.md" if path.suffix == ".py" else None)
+
+
+def file_of(page: str) -> Path:
+    """The file of the repository that is a page's text.
+
+    :param page: as MkDocs names it
+    """
+    names = {made: name for name, made in PAGES.items()}
+    return ROOT / names[page] if page in names else ROOT / "docs" / page
+
+
+def text_of(path: Path) -> str:
+    """A file as Markdown: a notebook's cells without their outputs, Python as code, Markdown as it is."""
+    text = path.read_text()
+    if path.suffix == ".ipynb":
+        cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(text)["cells"]]
+        return "\n\n".join(f"```python\n{source}\n```" if kind == "code" else source for source, kind in cells)
+    return f"# {path.name}\n\n`````python\n{text}`````\n" if path.suffix == ".py" else text
+
+
+def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
+    """Add the pages from outside."""
+    for name, page in PAGES.items():
+        files.append(File.generated(config, page, content=text_of(ROOT / name)))
+    for page in [file.src_uri for file in files.documentation_pages()]:
+        here = file_of(page)
+        for target in LINK.findall(text_of(here)):
+            path = (here.parent / target).resolve()
+            source = page_of(path)
+            if source is not None and source.startswith("source/") and source not in files.src_uris:
+                files.append(File.generated(config, source, content=text_of(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Rewrite the links of a page for its place on the site."""
+    if page.file.src_uri.startswith("source/"):
+        return markdown
+    here = file_of(page.file.src_uri).parent
+    folder = os.path.dirname(page.file.src_uri) or "."
+
+    def moved(match: re.Match[str]) -> str:
+        target = page_of((here / match[0]).resolve())
+        return match[0] if target is None else os.path.relpath(target, folder)
+
+    return LINK.sub(moved, markdown)
