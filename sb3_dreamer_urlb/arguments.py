@@ -93,6 +93,8 @@ def check(model: DreamerV2) -> None:
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
     if model.discount_head is not None and not isinstance(model.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {model.discount_head!r}.")
+    if not isinstance(model.overlap, bool):
+        raise ValueError(f"overlap must be True or False, got {model.overlap!r}.")
     if model.action_noise is not None and not isinstance(model.action_noise, ActionNoise):
         raise ValueError(f"action_noise must be an ActionNoise of Stable-Baselines3 or None, got {model.action_noise!r}.")
     _check_names(model)

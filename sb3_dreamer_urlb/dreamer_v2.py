@@ -13,10 +13,10 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, numerical_faults, phases, run_checkpoints
+from sb3_dreamer_urlb import arguments, numerical_faults, phases, run_checkpoints, training_loop
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
@@ -92,6 +92,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     :param device: "auto", "cpu", "cuda"
     :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
         faster on this machine at this size; losses, statistics and weights are float32 in any case
+    :param overlap: let environments in other processes step while an update runs; the result is the same, bit for bit. False
+        lets them take turns
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -148,6 +150,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
         precision: str = "auto",
+        overlap: bool = True,
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -196,6 +199,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.weight_decay = weight_decay
         self.discount_head = discount_head
         self.precision = precision
+        self.overlap = overlap
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -258,6 +262,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.learner.updates = self.phase_updates
         if self.verbose >= 1:
             print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
+            print(f"Replay in the store {self.replay_buffer.store!r}")
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
@@ -357,6 +362,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         pretrained = self.policy.agent
         self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
+        self.replay_buffer.close()
         del self.replay_buffer
         self._build()
         phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
@@ -415,31 +421,11 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             )
             callbacks.on_training_start(locals(), globals())
             try:
-                self._collect_and_train(total_timesteps, callbacks, log_interval)
+                training_loop.learn(self, total_timesteps, callbacks, log_interval)
             except EnvironmentFaultError as error:
                 raise EnvironmentFaultError(f"{error} {save_last_good_state(self)}") from error
             callbacks.on_training_end()
             return self
-
-    def _collect_and_train(self, total_timesteps: int, callbacks: BaseCallback, log_interval: int) -> None:
-        assert isinstance(self.train_freq, TrainFreq)
-        while self.num_timesteps < total_timesteps:
-            assert self.env is not None
-            rollout = self.collect_rollouts(
-                self.env,
-                callbacks,
-                self.train_freq,
-                self.replay_buffer,
-                self.action_noise,
-                self.learning_starts,
-                log_interval,
-            )
-            if not rollout.continue_training:
-                break
-            # SB3 gates on num_timesteps, which every learn() resets.
-            if self.phase_timesteps > self.learning_starts:
-                steps = self.gradient_steps if self.gradient_steps >= 0 else rollout.episode_timesteps
-                self.train(steps, self.batch_size)
 
     def _setup_learn(
         self,
@@ -477,6 +463,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         for _ in range(gradient_steps):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             self._metrics.add(self.learner.update(batch))
+            # While the device works on the update, and until the next one.
+            self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
         numerical_faults.stop_if_repeated(self)

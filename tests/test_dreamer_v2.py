@@ -173,7 +173,7 @@ def test_learning_rate_schedules(tiny_model):
     model = tiny_model(vec_env(1, 8), intrinsic_reward="lbs", weight_decay=1e-3, **schedules)
     model.learn(100, callback=Stopper(40))
     used = {name: optimizer.adam.param_groups[0] for name, optimizer in model.learner.optimizers().items()}
-    remaining = 1 - 36 / 100  # at the last update
+    remaining = 1 - 40 / 100  # at the last update
     for name, rate in (("model", 1e-2), ("intrinsic", 1e-2), ("actor", 1e-3), ("critic", 1e-4)):
         group = used[f"{name}_optimizer"]
         assert group["lr"] == pytest.approx(rate * remaining)

@@ -61,8 +61,8 @@ class Streams:
                 self.now[i] = self._begin()
 
 
-def make_buffer(size=1500, n_envs=3, batch_length=10, **kwargs):
-    return SequenceReplayBuffer(size, IMAGE, ACTION, "cpu", n_envs, batch_length=batch_length, seed=0, **kwargs)
+def make_buffer(size=1500, n_envs=3, batch_length=10, image=IMAGE, **kwargs):
+    return SequenceReplayBuffer(size, image, ACTION, "cpu", n_envs, batch_length=batch_length, seed=0, **kwargs)
 
 
 def decode(batch):
@@ -99,20 +99,38 @@ def check_rows(batch, ends=None):
         assert np.array_equal(batch.is_terminal.numpy(), terminal)
 
 
-@pytest.mark.parametrize("store", ["memory", "lmdb"])
-def test_trap(store, tmp_path):
+#: everything that keeps or brings rows, as arguments
+STORES = {
+    "memory": {},
+    "lmdb": {"store": "lmdb", "path": "replay"},
+    "device": {"store": "device"},
+    "memory, prefetched": {"prefetch": True},
+    "lmdb, prefetched": {"store": "lmdb", "path": "replay", "prefetch": True},
+}
+
+
+@pytest.fixture(params=STORES)
+def store(request, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return STORES[request.param]
+
+
+def test_trap(store):
     rng = np.random.default_rng(1)
-    buffer = make_buffer(**({} if store == "memory" else {"store": store, "path": tmp_path}))
+    buffer = make_buffer(**store)
     streams = Streams(buffer, lambda _: (int(rng.integers(1, 121)), rng.choice(["terminal", "truncated"])))
     for step in range(3 * 1500):  # three rows a step: nine times round
         streams.step()
         if step % 500 == 400:
             check_rows(streams.buffer.sample(20), held(streams))
+        if step % 50 == 0 and buffer.can_sample():
+            buffer.prefetch(20)
     expected = held(streams)
     assert len(streams.finished) > 200 and {end for *_, end in expected} == {"terminal", "truncated"}
     draws: Counter[tuple[int, int]] = Counter()
     for _ in range(100):
         batch = streams.buffer.sample(100)
+        streams.buffer.prefetch(100)
         check_rows(batch, expected)
         episode, t = decode(batch)
         draws.update(zip(episode[:, 0].tolist(), t[:, 0].tolist(), strict=True))
@@ -176,11 +194,9 @@ def check_rows_in_a_row(batch, expected):
     assert np.allclose(batch.reward.numpy(), np.where(led, episode + t / 1000, 0), atol=1e-3)
 
 
-@pytest.mark.parametrize("store", ["memory", "lmdb"])
-def test_sampling_by_rows(store, tmp_path):
+def test_sampling_by_rows(store):
     """Short episodes are kept, sequences run on into the next one, and no row is rarer than another, last ones included."""
-    in_store = {} if store == "memory" else {"store": store, "path": tmp_path}
-    buffer = make_buffer(300, n_envs=1, sampling="rows", **in_store)
+    buffer = make_buffer(300, n_envs=1, sampling="rows", **store)
     streams = Streams(buffer, lambda e: ((1, 40, 12, 3, 25)[e % 5], "terminal" if e % 3 else "truncated"))
     while len(streams.finished) < 40:
         streams.step()
@@ -194,6 +210,7 @@ def test_sampling_by_rows(store, tmp_path):
     draws: Counter[tuple[int, int]] = Counter()
     for _ in range(50):
         batch = buffer.sample(20)
+        buffer.prefetch(20)
         check_rows_in_a_row(batch, expected)
         episode, t = decode(batch)
         draws.update(zip(episode.flatten().tolist(), t.flatten().tolist(), strict=True))
@@ -230,8 +247,8 @@ def test_types_and_shapes_of_a_batch():
         assert getattr(batch, part).shape == (7, 10) and str(getattr(batch, part).dtype) == f"torch.{dtype}"
 
 
-def test_only_finished_episodes_are_drawn_and_closing_ends_them_as_truncated():
-    buffer = make_buffer(n_envs=2)
+def test_only_finished_episodes_are_drawn_and_closing_ends_them_as_truncated(store):
+    buffer = make_buffer(n_envs=2, **store)
     streams = Streams(buffer, lambda _: (1000, "terminal"))
     for _ in range(30):
         streams.step()
@@ -243,8 +260,8 @@ def test_only_finished_episodes_are_drawn_and_closing_ends_them_as_truncated():
     assert buffer.finished_count == 2
 
 
-def test_endless_episodes_are_drawn_in_pieces():
-    buffer = make_buffer(size=60, n_envs=1, max_episode_rows=20)
+def test_endless_episodes_are_drawn_in_pieces(store):
+    buffer = make_buffer(size=60, n_envs=1, max_episode_rows=20, **store)
     streams = Streams(buffer, lambda _: (10**6, "terminal"))
     for step in range(1, 200):
         streams.step()
@@ -277,14 +294,16 @@ def test_memory_is_taken_as_episodes_arrive_and_given_back():
     assert buffer.episodes[0].observation.nbytes == 201 * 3 * 64 * 64
 
 
-def test_equal_seeds_draw_equally(tmp_path):
+@pytest.mark.parametrize("kwargs", [STORES["memory"], STORES["device"], STORES["memory, prefetched"]])
+def test_equal_seeds_draw_equally(tmp_path, kwargs):
     batches = []
     for _ in range(2):
-        streams = Streams(make_buffer(), lambda e: (15 + e % 7, "truncated"))
+        streams = Streams(make_buffer(**kwargs), lambda e: (15 + e % 7, "truncated"))
         for _ in range(100):
             streams.step()
         batches.append(streams.buffer.sample(30))
     assert np.array_equal(*[batch.observation.numpy() for batch in batches])
+    streams.buffer.prefetch(30)
     save_to_pkl(tmp_path / "replay.pkl", streams.buffer)
     copy = load_from_pkl(tmp_path / "replay.pkl")
     assert np.array_equal(copy.sample(30).observation, streams.buffer.sample(30).observation)
@@ -304,8 +323,8 @@ def test_a_sequence_longer_than_what_is_kept_is_refused(name, kwargs):
         make_buffer(**kwargs)
 
 
-def test_reset_forgets_everything():
-    streams = Streams(make_buffer(), lambda _: (20, "truncated"))
+def test_reset_forgets_everything(store):
+    streams = Streams(make_buffer(**store), lambda _: (20, "truncated"))
     for _ in range(25):
         streams.step()
     streams.buffer.reset()

@@ -55,18 +55,6 @@ def counters(buffer):
     return buffer.evicted, buffer.finished_rows, buffer.finished_count, buffer.longest
 
 
-def test_disk_and_memory_hold_and_draw_the_same(tmp_path):
-    memory, disk = filled(make_buffer()).buffer, filled(on_disk(tmp_path)).buffer
-    assert memory.evicted > 0 and contents(memory) == contents(disk) and counters(memory) == counters(disk)
-    for _ in range(5):
-        mine, its = memory.sample(40), disk.sample(40)
-        for name in ("observation", "action", "reward", "is_first", "is_terminal"):
-            assert (
-                np.array_equal(getattr(mine, name), getattr(its, name))
-                and getattr(mine, name).dtype == getattr(its, name).dtype
-            )
-
-
 @given(start=st.integers(0, 90), length=st.integers(1, 90))
 def test_any_part_of_an_episode(tmp_path_factory, start, length):
     buffer = on_disk(tmp_path_factory.mktemp("part"), n_envs=1)
@@ -231,11 +219,14 @@ def test_missing_rows_are_an_error_that_names_them(tmp_path):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"store": "disk"}, r"store must be one of \['memory', 'lmdb'\], got 'disk'"),
+        ({"store": "disk"}, r"store must be one of \['auto', 'memory', 'device', 'lmdb'\], got 'disk'"),
         ({"store": "lmdb"}, "path=None: a path is for store='lmdb', which needs one"),
         ({"path": "x"}, "path='x': a path is for store='lmdb'"),
         ({"map_size": 1 << 30}, "map_size .* is for store='lmdb' only"),
         ({"store": "lmdb", "path": "x", "map_size": 5}, "map_size must be at least 1048576 bytes.*got 5"),
+        ({"store": "device", "path": "x"}, "path='x': a path is for store='lmdb'"),
+        ({"store": "device", "prefetch": True}, "prefetch=True and store='device': rows that are on the device need no"),
+        ({"prefetch": "yes"}, "prefetch must be True, False or None, got 'yes'"),
     ],
 )
 def test_arguments(tiny_model, kwargs, message):

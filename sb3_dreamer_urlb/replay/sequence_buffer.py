@@ -7,10 +7,12 @@ stream, so episodes may end at different times; only finished episodes are drawn
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import warnings
 from collections import deque
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,121 +24,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.env_steps import is_fault
-from sb3_dreamer_urlb.replay import stores
+from sb3_dreamer_urlb.replay import gathering, stores
+from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
+from sb3_dreamer_urlb.replay.episode import Episode, RawObservation, observation_columns, observation_of
+from sb3_dreamer_urlb.replay.prefetch import Prefetcher
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, check_sampling, draw
 from sb3_dreamer_urlb.types import SequenceBatch
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.replay.lmdb_store import LmdbStore
-
-RawObservation = np.ndarray | dict[str, np.ndarray]
-#: column of an observation, or of the part of a Dict observation whose name follows
-OBSERVATION = "observation"
-
-
-class Episode:
-    """Contiguous rows that grow while the episode is open.
-
-    :param observation: the episode's first observation; a Dict observation takes one column for each part
-    :param action_size: A
-    :param skill: under which the first action is chosen, (W,)
-    """
-
-    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray):
-        capacity = 128
-        seen = observation_columns(observation)
-        #: rows of each column, the first ``length`` of them filled
-        self.columns: dict[str, np.ndarray] = {
-            **{name: np.empty((capacity, *value.shape), value.dtype) for name, value in seen.items()},
-            "action": np.zeros((capacity, action_size), np.float32),
-            "reward": np.zeros(capacity, np.float32),
-            "is_terminal": np.zeros(capacity, bool),
-            "skill": np.zeros((capacity, len(skill)), np.float32),
-        }
-        self.length = 0
-        self._put({**seen, "skill": skill})
-
-    @classmethod
-    def of(cls, columns: dict[str, np.ndarray]) -> Episode:
-        """A finished episode of given rows, for example from a file.
-
-        :param columns: rows of each of ``SequenceReplayBuffer.columns``
-        """
-        episode = cls.__new__(cls)
-        episode.columns, episode.length = columns, len(columns["reward"])
-        return episode
-
-    def __len__(self) -> int:
-        return self.length
-
-    @property
-    def observation(self) -> RawObservation:
-        """All rows of it, by name for Dict observations."""
-        return observation_of(self.columns)
-
-    @property
-    def action(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["action"]
-
-    @property
-    def reward(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["reward"]
-
-    @property
-    def is_terminal(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["is_terminal"]
-
-    @property
-    def skill(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["skill"]
-
-    def append(
-        self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
-    ) -> None:
-        """Add the row that ``action``, chosen under ``skill``, led to."""
-        if self.length == len(self.reward):
-            self._resize(2 * self.length)
-        seen = observation_columns(observation)
-        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
-
-    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
-        """Some rows of every column, by name; no copies."""
-        return {name: part[start:stop] for name, part in self.columns.items()}
-
-    def finish(self) -> Episode:
-        """Give unused memory back."""
-        self._resize(self.length)
-        return self
-
-    def _put(self, row: dict[str, Any]) -> None:
-        for name, value in row.items():
-            self.columns[name][self.length] = value
-        self.length += 1
-
-    def _resize(self, capacity: int) -> None:
-        for name, old in self.columns.items():
-            new = np.empty((capacity, *old.shape[1:]), old.dtype)
-            new[: self.length] = old[: self.length]
-            self.columns[name] = new
-
-
-def observation_columns(observation: RawObservation) -> dict[str, np.ndarray]:
-    """The columns that an observation fills: one, or one for each part of a Dict observation."""
-    if isinstance(observation, dict):
-        return {f"{OBSERVATION}/{name}": np.asarray(part) for name, part in observation.items()}
-    return {OBSERVATION: np.asarray(observation)}
-
-
-def observation_of(columns: dict[str, np.ndarray]) -> RawObservation:
-    """The observation among columns; undoes :func:`observation_columns`."""
-    if OBSERVATION in columns:
-        return columns[OBSERVATION]
-    prefix = f"{OBSERVATION}/"
-    return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}
 
 
 def _zeros(space: spaces.Space[Any]) -> np.ndarray:
@@ -145,7 +41,7 @@ def _zeros(space: spaces.Space[Any]) -> np.ndarray:
 
 
 class SequenceReplayBuffer(ReplayBuffer):
-    """Replay of episodes, one stream per environment; finished ones in memory or on disk.
+    """Replay of episodes, one stream per environment; finished ones in memory, on the learner's device or on disk.
 
     Memory is taken as episodes arrive. When more than ``buffer_size`` rows are held, whole episodes go, oldest first.
 
@@ -159,10 +55,13 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param seed: of the sampler
     :param phase: name of the phase that filled it; a fine-tuning refuses a pre-training's buffer
     :param skill_size: W, size of the skills to store with each row, 0 for none
-    :param store: ``"memory"``, or ``"lmdb"`` for a file that survives the process (``pip install
-        'sb3_dreamer_urlb[lmdb]'``); open episodes are in memory in any case
+    :param store: ``"memory"``; ``"device"`` for the memory of ``device``, so that batches need not go there; ``"auto"`` for
+        the latter on CUDA if ``buffer_size`` rows fit, else the former; or ``"lmdb"`` for a file that survives the process
+        (``pip install 'sb3_dreamer_urlb[lmdb]'``). Open episodes are in memory in any case
     :param path: folder of the file; each phase has its own in it. Rows that an earlier run left there are taken over
     :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
+    :param prefetch: let a thread gather the next batch and bring it to the device while something else goes on
+        (:meth:`prefetch`); None does so on CUDA. Not for ``store="device"``, which has nothing to bring
     :param sampling: ``"episodes"`` draws an episode uniformly, then a start uniformly, and leaves out episodes shorter than
         a sequence (the paper); ``"rows"`` draws the start from all rows uniformly, and goes on with the next episode's first
         row where one ends before the sequence does. For tasks that terminate: short episodes are kept and weigh no more
@@ -184,9 +83,10 @@ class SequenceReplayBuffer(ReplayBuffer):
         seed: int | None = None,
         phase: str = "",
         skill_size: int = 0,
-        store: str = "memory",
+        store: str = stores.AUTO,
         path: str | os.PathLike[str] | None = None,
         map_size: int | None = None,
+        prefetch: bool | None = None,
         sampling: str = BY_EPISODE,
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
@@ -209,7 +109,17 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.disk: LmdbStore | None = None
         self.path = None if path is None else Path(path) / (phase or "replay")
         self.map_size = map_size
-        stores.warn_if_too_large(buffer_size, self.row_bytes(), self.path)
+        #: name of the store, never ``"auto"``
+        self.store = stores.choose(store, self.device, buffer_size * self.row_bytes())
+        on_device = self.store == stores.DEVICE
+        stores.warn_if_too_large(buffer_size, self.row_bytes(), self.path, self.device if on_device else None)
+        if prefetch is not None and not isinstance(prefetch, bool):
+            raise ValueError(f"prefetch must be True, False or None, got {prefetch!r}.")
+        if prefetch and on_device:
+            raise ValueError(f"prefetch={prefetch!r} and store='device': rows that are on the device need no fetching.")
+        self.prefetches = self.device.type == "cuda" and not on_device if prefetch is None else prefetch
+        self._prefetcher: Prefetcher[tuple[gathering.Tensors, Mapping[str, Any]]] = Prefetcher()
+        self._transfer = gathering.make_transfer(self.device if self.prefetches else None)
         self._reset_memory()
 
     def row_bytes(self) -> int:
@@ -224,6 +134,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             self.roll_back(0, {"evicted": 0, "finished_count": 0, "longest": 0})
 
     def _reset_memory(self) -> None:
+        self._prefetcher.discard()
         #: finished episodes, oldest first
         self.episodes: Any = deque() if self.disk is None else self.disk
         self.open: list[Episode | None] = [None] * self.n_envs
@@ -264,6 +175,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         :param counters: ``evicted``, ``finished_count`` and ``longest`` as of the checkpoint
         """
         assert self.disk is not None
+        self._prefetcher.discard()
         numbers = {name: counters[name] for name in ("finished_count", "longest")}
         lost = self.disk.roll_back(end, counters["evicted"], numbers)
         if lost:
@@ -339,12 +251,22 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.longest = max(self.longest, len(episode))
         if self.sampling == BY_EPISODE and len(episode) < self.batch_length:
             return
+        self._prefetcher.discard()
         if self.disk is None:
-            self.episodes.append(episode.finish())
-            self.finished_rows += len(episode)
+            self.hold([episode.finish()])
             self.evict()
         else:
             self._write(episode)
+
+    def hold(self, episodes: Iterable[Episode]) -> None:
+        """Take finished episodes in, not on disk.
+
+        :param episodes: long enough to be drawn
+        :raises MemoryError: if the device has no memory for them
+        """
+        for episode in episodes:
+            self.episodes.append(DeviceEpisode.put(episode, self.device) if self.store == stores.DEVICE else episode)
+            self.finished_rows += len(episode)
 
     def _write(self, episode: Episode) -> None:
         """To the disk, together with what has to go for it."""
@@ -386,31 +308,70 @@ class SequenceReplayBuffer(ReplayBuffer):
         """
         if not self.can_sample():
             raise ValueError(f"No finished episode has batch_length={self.batch_length} rows yet.")
-        length = self.batch_length
-        columns = {
-            name: np.empty((batch_size, length, *rows.shape[1:]), rows.dtype)
-            for name, rows in self.episodes[0].rows(0, 1).items()
-        }
-        is_first = np.zeros((batch_size, length), bool)
-        for b, pieces in enumerate(draw(self.sampling, self.rng, self.episodes, length, batch_size)):
-            t = 0
-            for index, start, stop in pieces:
-                is_first[b, t] = True
-                for name, rows in self.episodes[index].rows(start, stop).items():
-                    columns[name][b, t : t + stop - start] = rows
-                t += stop - start
-        observation = self._normalize_obs(observation_of(columns), env)
-        reward = self._normalize_reward(columns["reward"], env).astype(np.float32, copy=False)
+        columns = self._drawn(batch_size) if env is None else self._drawn_and_normalized(batch_size, env)
         return SequenceBatch(
-            {name: self._tensor(part) for name, part in observation.items()}
-            if isinstance(observation, dict)
-            else self._tensor(observation),
-            self._tensor(columns["action"]),
-            self._tensor(reward),
-            self._tensor(is_first),
-            self._tensor(columns["is_terminal"]),
-            self._tensor(columns["skill"]) if self.skill_size else None,
+            observation_of(columns),
+            columns["action"],
+            columns["reward"],
+            columns[gathering.IS_FIRST],
+            columns["is_terminal"],
+            columns["skill"] if self.skill_size else None,
         )
+
+    def _drawn(self, batch_size: int) -> gathering.Tensors:
+        """A batch as it is stored, on ``device``."""
+        found = self._prefetcher.take(self._moment(batch_size))
+        if found is not None:
+            columns, self.rng.bit_generator.state = found
+            return self._transfer.ready(columns)
+        draws = self._draws(self.rng, batch_size)
+        if self.store == stores.DEVICE:
+            return gathering.on_device(draws, self.batch_length)
+        if self.prefetches:
+            return self._transfer.ready(self._transfer.bring(draws, self.batch_length))
+        return {name: self._tensor(rows) for name, rows in gathering.on_host(draws, self.batch_length).items()}
+
+    def _drawn_and_normalized(self, batch_size: int, env: VecNormalize) -> gathering.Tensors:
+        """A batch normalised with the present statistics, which are numpy's, on the host."""
+        columns = gathering.on_host(self._draws(self.rng, batch_size), self.batch_length)
+        observation: Any = self._normalize_obs(observation_of(columns), env)
+        reward = self._normalize_reward(columns["reward"], env).astype(np.float32, copy=False)
+        columns = {**columns, **observation_columns(observation), "reward": reward}
+        return {name: self._tensor(rows) for name, rows in columns.items()}
+
+    def _draws(self, rng: np.random.Generator, batch_size: int) -> list[gathering.Draw]:
+        """Which rows make the sequences."""
+        places = draw(self.sampling, rng, self.episodes, self.batch_length, batch_size)
+        return [[(self.episodes[index], start, stop) for index, start, stop in pieces] for pieces in places]
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device, non_blocking=True)
+
+    # -- ahead of time -------------------------------------------------------------------------------------------------
+
+    def prefetch(self, batch_size: int, env: VecNormalize | None = None) -> None:
+        """Begin to gather what :meth:`sample` will give next, in a thread; nothing happens unless ``prefetches``.
+
+        It is drawn with a copy of the sampler, and taken only if sampler, episodes and size are the same then: otherwise
+        it is dropped, and drawn again as if nothing had been. So batches do not depend on it.
+
+        :param batch_size: B
+        :param env: whose statistics the batch will be normalised with: they may change until then, so nothing is begun
+        """
+        if not self.prefetches or env is not None or not self.can_sample():
+            return
+        rng = copy.deepcopy(self.rng)
+        draws = self._draws(rng, batch_size)
+        transfer, length, after = self._transfer, self.batch_length, rng.bit_generator.state
+        self._prefetcher.begin(self._moment(batch_size), lambda: (transfer.bring(draws, length), after))
+
+    def _moment(self, batch_size: int) -> tuple[Any, ...]:
+        """All that a batch depends on: what changes none of it leaves the batch the same."""
+        held = (id(self.episodes), self.evicted, len(self.episodes), self.finished_rows)
+        return batch_size, *held, self.rng.bit_generator.state
+
+    def close(self) -> None:
+        """End the thread, and give the device's memory back: rows that are there are forgotten, others stay."""
+        self._prefetcher.close()
+        if self.store == stores.DEVICE:
+            self._reset_memory()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import safetensors.numpy
 
-from sb3_dreamer_urlb.replay.sequence_buffer import Episode
+from sb3_dreamer_urlb.replay.episode import Episode
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import Archive, Target, reading, writing
 from sb3_dreamer_urlb.snapshots.random_state import generator_state, set_generator
@@ -122,8 +122,7 @@ def restore(buffer: SequenceReplayBuffer, finished: list[Episode], open_: list[E
     :param open_: open ones, which end here as truncated
     :param numbers: its counters
     """
-    buffer.episodes.extend(finished)
-    buffer.finished_rows = sum(map(len, finished))
+    buffer.hold(finished)
     for name in ("evicted", "finished_count", "longest"):
         setattr(buffer, name, numbers[name])
     close(buffer, open_)

@@ -1,0 +1,117 @@
+"""One episode in memory, and what columns its rows have."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+
+Rows = TypeVar("Rows")
+RawObservation = np.ndarray | dict[str, np.ndarray]
+#: column of an observation, or of the part of a Dict observation whose name follows
+OBSERVATION = "observation"
+
+
+class Episode:
+    """Contiguous rows that grow while the episode is open.
+
+    :param observation: the episode's first observation; a Dict observation takes one column for each part
+    :param action_size: A
+    :param skill: under which the first action is chosen, (W,)
+    """
+
+    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray):
+        capacity = 128
+        seen = observation_columns(observation)
+        #: rows of each column, the first ``length`` of them filled
+        self.columns: dict[str, np.ndarray] = {
+            **{name: np.empty((capacity, *value.shape), value.dtype) for name, value in seen.items()},
+            "action": np.zeros((capacity, action_size), np.float32),
+            "reward": np.zeros(capacity, np.float32),
+            "is_terminal": np.zeros(capacity, bool),
+            "skill": np.zeros((capacity, len(skill)), np.float32),
+        }
+        self.length = 0
+        self._put({**seen, "skill": skill})
+
+    @classmethod
+    def of(cls, columns: dict[str, np.ndarray]) -> Episode:
+        """A finished episode of given rows, for example from a file.
+
+        :param columns: rows of each of ``SequenceReplayBuffer.columns``
+        """
+        episode = cls.__new__(cls)
+        episode.columns, episode.length = columns, len(columns["reward"])
+        return episode
+
+    def __len__(self) -> int:
+        return self.length
+
+    @property
+    def observation(self) -> RawObservation:
+        """All rows of it, by name for Dict observations."""
+        return observation_of(self.columns)
+
+    @property
+    def action(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["action"]
+
+    @property
+    def reward(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["reward"]
+
+    @property
+    def is_terminal(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["is_terminal"]
+
+    @property
+    def skill(self) -> np.ndarray:
+        """All rows of it."""
+        return self.columns["skill"]
+
+    def append(
+        self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
+    ) -> None:
+        """Add the row that ``action``, chosen under ``skill``, led to."""
+        if self.length == len(self.reward):
+            self._resize(2 * self.length)
+        seen = observation_columns(observation)
+        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
+
+    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Some rows of every column, by name; no copies."""
+        return {name: part[start:stop] for name, part in self.columns.items()}
+
+    def finish(self) -> Episode:
+        """Give unused memory back."""
+        self._resize(self.length)
+        return self
+
+    def _put(self, row: dict[str, Any]) -> None:
+        for name, value in row.items():
+            self.columns[name][self.length] = value
+        self.length += 1
+
+    def _resize(self, capacity: int) -> None:
+        for name, old in self.columns.items():
+            new = np.empty((capacity, *old.shape[1:]), old.dtype)
+            new[: self.length] = old[: self.length]
+            self.columns[name] = new
+
+
+def observation_columns(observation: RawObservation) -> dict[str, np.ndarray]:
+    """The columns that an observation fills: one, or one for each part of a Dict observation."""
+    if isinstance(observation, dict):
+        return {f"{OBSERVATION}/{name}": np.asarray(part) for name, part in observation.items()}
+    return {OBSERVATION: np.asarray(observation)}
+
+
+def observation_of(columns: dict[str, Rows]) -> Rows | dict[str, Rows]:
+    """The observation among columns, arrays or tensors; undoes :func:`observation_columns`."""
+    if OBSERVATION in columns:
+        return columns[OBSERVATION]
+    prefix = f"{OBSERVATION}/"
+    return {name.removeprefix(prefix): rows for name, rows in columns.items() if name.startswith(prefix)}

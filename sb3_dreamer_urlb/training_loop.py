@@ -1,0 +1,127 @@
+"""The training loop: act, update while the environments step, keep what they gave.
+
+The updates of a rollout come after its last action is chosen and before that step's rows are kept: act, update, step, as in
+the authors' own loop. So an environment in another process can step and render while the learner works, and since neither
+needs the other, it makes no difference to either whether they take turns (``overlap=False``) or not: the same transitions,
+batches and weights, bit for bit. Compared with SB3's order (act, step, update), the same weights choose every action; an
+episode that ends with a rollout's last step is drawn from the next updates on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+
+class LearningVecEnv(VecEnvWrapper):
+    """Environments in whose last step of a rollout the learner works.
+
+    SB3's own rollouts run on it: callbacks, noise, logs and counters are SB3's.
+
+    :param venv: the environments
+    :param update: what to do in that step
+    :param overlap: do it after the actions are sent and before results are waited for; otherwise before they are sent
+    """
+
+    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool):
+        super().__init__(venv)
+        self.update, self.overlap = update, overlap
+        self.left: int | None = None
+
+    def begin(self, steps: int | None) -> LearningVecEnv:
+        """A rollout begins.
+
+        :param steps: it has; None where nobody knows, so that no update can come before its last step ends
+        :return: self
+        """
+        self.left = steps
+        return self
+
+    def reset(self) -> VecEnvObs:
+        """As the environments'."""
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Send the actions."""
+        if self.left is not None:
+            self.left -= 1
+        if self.left == 0 and not self.overlap:
+            self.update()
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """:raises Exception: of the update, which comes first, or of the environments"""
+        if self.left == 0 and self.overlap:
+            try:
+                self.update()
+            except BaseException:
+                # Or the next question to a process would get the answer to this one.
+                with suppress(Exception):
+                    self.venv.step_wait()
+                raise
+        return self.venv.step_wait()
+
+
+def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_interval: int) -> None:
+    """Collect and update until the steps are done, or a callback ends it.
+
+    :param model: set up by SB3's ``_setup_learn``
+    :param total_timesteps: value of ``num_timesteps`` to reach
+    :param callbacks: told as SB3 tells them
+    :param log_interval: episodes between two log lines
+    """
+    assert isinstance(model.train_freq, TrainFreq)
+    frequency, unit = model.train_freq
+    steps = frequency if unit == TrainFrequencyUnit.STEP else None
+    env: LearningVecEnv | None = None
+    while model.num_timesteps < total_timesteps:
+        assert model.env is not None
+        if env is None or env.venv is not model.env:
+            # At first, and when a callback brought other environments.
+            env = LearningVecEnv(model.env, lambda: _update(model, ahead=model.n_envs), model.overlap)
+        rollout = model.collect_rollouts(
+            env.begin(steps),
+            callbacks,
+            model.train_freq,
+            model.replay_buffer,
+            model.action_noise,
+            model.learning_starts,
+            log_interval,
+        )
+        if not rollout.continue_training:
+            break
+        if steps is None:
+            # Which step is an episode's last is known afterwards.
+            _update(model, rollout.episode_timesteps)
+
+
+def _update(model: DreamerV2, collected: int | None = None, ahead: int = 0) -> None:
+    """The updates after, or within the last step of, one rollout.
+
+    :param collected: agent steps of the rollout; None: as many as ``train_freq`` says
+    :param ahead: agent steps that are under way, and not yet counted in ``num_timesteps``
+    """
+    # SB3 gates on num_timesteps, which every learn() resets.
+    if model.phase_timesteps <= model.learning_starts:
+        return
+    if collected is None:
+        assert isinstance(model.train_freq, TrainFreq)
+        collected = model.train_freq.frequency * model.n_envs
+    model._update_current_progress_remaining(model.num_timesteps + ahead, model._total_timesteps)
+    try:
+        model.train(model.gradient_steps if model.gradient_steps >= 0 else collected, model.batch_size)
+    except BaseException:
+        # A step that was sent is lost: whoever goes on with this model needs a reset.
+        model._last_obs = None
+        raise
+    model.policy.set_training_mode(False)
