@@ -87,7 +87,9 @@ class PreparedAgent(PlannedAgent):
     def values(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
         skill = self._skill_of(feature[0].deter)
         value = self._ask(self._value, feature, skill)
-        return (value * skill).sum(-1) if isinstance(self.agent.slow_critic, SuccessorCritic) else value.squeeze(-1)
+        if skill is None or not isinstance(self.agent.slow_critic, SuccessorCritic):
+            return value.squeeze(-1)
+        return (value * skill).sum(-1)
 
     def discounts(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
         gamma = self.agent.world_model.gamma
