@@ -236,6 +236,9 @@ class _Guess:
         t = state.deter[:, :1].long()
         return LatentState(reward.gather(1, t.clamp(max=2)), state.deter + 1)
 
+    def features(self, states):
+        return th.stack([state.feature for state in states])
+
     def rewards(self, feature):
         return feature[..., 0]
 

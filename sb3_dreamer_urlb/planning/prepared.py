@@ -87,9 +87,8 @@ class PreparedAgent(PlannedAgent):
     def values(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
         skill = self._skill_of(feature[0].deter)
         value = self._ask(self._value, feature, skill)
-        if not isinstance(self.agent.slow_critic, SuccessorCritic):
+        if skill is None or not isinstance(self.agent.slow_critic, SuccessorCritic):
             return value.squeeze(-1)
-        assert skill is not None
         return (value * skill).sum(-1)
 
     def discounts(self, feature: Sequence[SampledState]) -> th.Tensor:  # type: ignore[override]
