@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb.graphs import COMPILE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
@@ -55,6 +56,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "planner",
     "planning",
     "precision",
+    "compile",
 }
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
@@ -100,6 +102,8 @@ def check(model: DreamerV2) -> None:
 def _check_names(model: DreamerV2) -> None:
     if model.precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
+    if model.compile not in COMPILE:
+        raise ValueError(f"compile must be one of {COMPILE}, got {model.compile!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:

@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, numerical_faults, phases
+from sb3_dreamer_urlb import arguments, graphs, numerical_faults, phases
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
@@ -85,6 +85,9 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     :param device: "auto", "cpu", "cuda"
     :param precision: of matrix products and convolutions: ``"float32"``, ``"bfloat16"``, or ``"auto"`` for whichever is
         faster on this machine at this size; losses, statistics and weights are float32 in any case
+    :param compile: how updates and actions run: ``"eager"``, operation by operation; ``"cuda_graphs"``, recorded once and
+        launched as a whole; ``"auto"``: CUDA graphs on CUDA, eager elsewhere. What cannot be recorded runs eager, after a
+        warning that says why
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -139,6 +142,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
         precision: str = "auto",
+        compile: str = "auto",
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -184,6 +188,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.weight_decay = weight_decay
         self.discount_head = discount_head
         self.precision = precision
+        self.compile = compile
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -225,6 +230,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             # As snapshots can hold it.
             self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
         arguments.check(self)
+        graphs.warn_if_in_vain(self.compile, self.device)
         self._convert_train_freq()
         self._read_env()
 
@@ -253,6 +259,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             precision=self.precision,
+            compile=self.compile,
             **self.policy_kwargs,
         )
 
@@ -279,6 +286,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
             reward_trains_model=not phases.PHASES[self.phase].explores,
             precision=self.precision,
+            compile=self.compile,
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
