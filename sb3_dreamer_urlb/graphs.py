@@ -123,13 +123,13 @@ class Recorder(Generic[Result]):
             result, refusal = self.backend.warm_up(lambda: self.function(inputs, generator, *situation))
             # Whatever torch sets up once may wait; what still waits in the last of them always will.
             if its.calls == WARM_UPS and refusal is not None:
-                self._give_up(refusal)
+                self.give_up(refusal)
             return result
         if its.recorded is None:
             try:
                 its.recorded = _Recorded(self.function, self.backend, inputs, generator, situation)
             except RuntimeError as error:
-                self._give_up(str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__)
+                self.give_up(str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__)
                 return self.function(inputs, generator, *situation)
         return its.recorded(inputs, generator)
 
@@ -149,7 +149,7 @@ class Recorder(Generic[Result]):
             return self._situations[key]
         self._new_situations += 1
         if self._new_situations > MAX_SITUATIONS:
-            self._give_up(f"sizes, settings or memory changed {MAX_SITUATIONS} times")
+            self.give_up(f"sizes, settings or memory changed {MAX_SITUATIONS} times")
             return None
         # First out, then in: two recordings of an update may not fit.
         while len(self._situations) >= self.keep:
@@ -157,8 +157,13 @@ class Recorder(Generic[Result]):
         self._situations[key] = _Situation()
         return self._situations[key]
 
-    def _give_up(self, reason: str) -> None:
-        warnings.warn(f"{self.name} runs without CUDA graphs, slower: {reason}")
+    def give_up(self, reason: str) -> None:
+        """Call the function from now on; warns where it would have been recorded.
+
+        :param reason: for the warning
+        """
+        if self.backend is not None:
+            warnings.warn(f"{self.name} runs without CUDA graphs, slower: {reason}")
         self.backend = None
         self._situations.clear()
 
@@ -245,8 +250,8 @@ class CudaGraphs:
             if generator is not None:
                 graph.register_generator_state(generator)
             try:
-                # Another thread may well fetch a batch meanwhile.
-                with th.cuda.graph(graph, capture_error_mode="thread_local"):
+                # Another thread may well fetch a batch meanwhile. A stream of this device: torch's own is of the first one.
+                with th.cuda.graph(graph, stream=th.cuda.Stream(), capture_error_mode="thread_local"):
                     results = work()
             except BaseException:
                 # torch would go on in the broken capture's stream, and count draws as the capture's.

@@ -78,6 +78,8 @@ class Learner:
         self.recorder: Recorder[Metrics] = Recorder(
             self._update, make_backend(config.compile, self.device), self._memory, "The update"
         )
+        if agent.intrinsic is not None and not agent.intrinsic.graph_safe:
+            self.recorder.give_up(f"{type(agent.intrinsic).__name__}.graph_safe is False")
 
     @property
     def device(self) -> th.device:

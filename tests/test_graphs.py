@@ -24,6 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from sb3_dreamer_urlb import DreamerV2, graphs, policies, precision
 from sb3_dreamer_urlb import learner as learner_module
 from sb3_dreamer_urlb.graphs import WARM_UPS, Recorder
+from sb3_dreamer_urlb.intrinsic import LBS
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 
@@ -118,6 +119,16 @@ def test_an_update_is_recorded_anew_when_it_changes(learner, batch, taped):
     state = {name: value + 0 for name, value in its.agent.state_dict().items()}
     assert tapes_after(lambda: its.agent.load_state_dict(state), small) == 4  # copied to where the weights are
     assert its.recorder.recordings == 1
+
+
+def test_a_method_that_changes_in_python_is_not_recorded(learner, batch, taped, monkeypatch):
+    monkeypatch.setattr(LBS, "graph_safe", False)
+    with pytest.warns(UserWarning, match="The update runs without CUDA graphs, slower: LBS.graph_safe is False") as caught:
+        its = learner("lbs", compile="cuda_graphs")
+        for _ in range(WARM_UPS + 2):
+            its.update(batch)
+    assert len(caught) == 1 and its.recorder.recordings == 0
+    learner("lbs")  # eager anyway: nothing to warn about
 
 
 def test_metrics_outlive_the_next_update(learner, batch, taped):
