@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
+from sb3_dreamer_urlb.graphs import COMPILE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
@@ -59,6 +60,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "planner",
     "planning",
     "precision",
+    "compile",
 }
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
@@ -129,6 +131,8 @@ def _check_names(model: DreamerV2) -> None:
         raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
     if model.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
         raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {model.actor_gradient!r}.")
+    if model.compile not in COMPILE:
+        raise ValueError(f"compile must be one of {COMPILE}, got {model.compile!r}.")
     method = model.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
     if intrinsic is not None:

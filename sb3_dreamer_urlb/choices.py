@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch as th
-import torch.nn.functional as F
 from gymnasium import spaces
 
 
@@ -19,11 +18,17 @@ def classes_of(space: spaces.Discrete | spaces.MultiDiscrete) -> tuple[int, ...]
     return tuple(np.atleast_1d(counts).flatten().tolist())
 
 
-def one_hot_numbers(numbers: th.Tensor, classes: Sequence[int]) -> th.Tensor:
+def one_hot_numbers(numbers: th.Tensor, classes: Sequence[int], start: Sequence[int] | None = None) -> th.Tensor:
     """One-hot vectors, one after the other, float32.
 
-    :param numbers: chosen classes, counted from 0, integer (…, len(classes))
+    :param numbers: chosen classes, integer (…, len(classes))
     :param classes: number of classes of each choice
+    :param start: what each choice's first class is called, 0 if None
+    :raises RuntimeError: on CPU, for a number that is no class; on CUDA torch ends the program
     """
-    parts = zip(numbers.long().unbind(-1), classes, strict=True)
-    return th.cat([F.one_hot(part, n) for part, n in parts], -1).to(th.float32)
+    parts = []
+    for part, n, first in zip(numbers.long().unbind(-1), classes, start or [0] * len(classes), strict=True):
+        zeros = part.new_zeros((*part.shape, n), dtype=th.float32)
+        # Not F.one_hot, which looks at the numbers on the host.
+        parts.append(zeros.scatter_(-1, (part - first).unsqueeze(-1), 1.0))
+    return th.cat(parts, -1)

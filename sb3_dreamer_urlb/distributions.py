@@ -183,7 +183,7 @@ class OneHotChoices:
     @property
     def mode(self) -> th.Tensor:
         """The most likely action, one-hot (…, A)."""
-        return th.cat([F.one_hot(part.argmax(-1), part.shape[-1]).to(part.dtype) for part in self.logits], -1)
+        return th.cat([one_hot_like(part, part.argmax(-1)) for part in self.logits], -1)
 
     def sample(self, generator: th.Generator | None = None) -> th.Tensor:
         """One-hot choices with straight-through gradients, (…, A)."""
@@ -191,7 +191,7 @@ class OneHotChoices:
 
     def entropy(self) -> th.Tensor:
         """In nats, summed over the choices: (…)."""
-        return sum((categorical_entropy(part.unsqueeze(-2)) for part in self.logits), th.zeros(()).to(self.logits[0]))
+        return th.stack([categorical_entropy(part.unsqueeze(-2)) for part in self.logits]).sum(0)
 
     def log_prob(self, action: th.Tensor) -> th.Tensor:
         """Log-probability of one-hot choices, (…, A) → (…)."""
@@ -207,7 +207,7 @@ def one_hot_choices(probs: th.Tensor, classes: Sequence[int], generator: th.Gene
     :param generator: source of randomness
     """
     parts = probs.split(tuple(classes), -1)
-    return th.cat([F.one_hot(draw_classes(part, generator), part.shape[-1]).to(probs.dtype) for part in parts], -1)
+    return th.cat([one_hot_like(part, draw_classes(part, generator)) for part in parts], -1)
 
 
 def bernoulli_nll(logit: th.Tensor, target: th.Tensor) -> th.Tensor:

@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, numerical_faults, phases, run_checkpoints, training_loop
+from sb3_dreamer_urlb import arguments, graphs, numerical_faults, phases, run_checkpoints, training_loop
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
@@ -94,6 +94,9 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         faster on this machine at this size; losses, statistics and weights are float32 in any case
     :param overlap: let environments in other processes step while an update runs; the result is the same, bit for bit. False
         lets them take turns
+    :param compile: how updates and actions run: ``"eager"``, operation by operation; ``"cuda_graphs"``, recorded once and
+        launched as a whole; ``"auto"``: CUDA graphs on CUDA, eager elsewhere. What cannot be recorded runs eager, after a
+        warning that says why
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -151,6 +154,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         device: th.device | str = "auto",
         precision: str = "auto",
         overlap: bool = True,
+        compile: str = "auto",
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
@@ -200,6 +204,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.discount_head = discount_head
         self.precision = precision
         self.overlap = overlap
+        self.compile = compile
         self.preset = preset
 
         #: name of the phase; with its own counters, which ``learn`` never resets
@@ -247,6 +252,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        graphs.warn_if_in_vain(self.compile, self.device)
         self._convert_train_freq()
         self._read_env()
 
@@ -277,6 +283,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             precision=self.precision,
+            compile=self.compile,
             **self.policy_kwargs,
         )
 
@@ -305,6 +312,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
             reward_trains_model=not phases.PHASES[self.phase].explores,
             precision=self.precision,
+            compile=self.compile,
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:

@@ -1,11 +1,12 @@
 """One update on one batch: losses → backward → optimiser steps. The only place that trains them.
 
-Nothing here asks the device for a value: metrics stay tensors until somebody logs them.
+Nothing here asks the device for a value: metrics stay tensors until somebody logs them. A CUDA graph can hold all of
+:meth:`Learner._update` (graphs.py); what happens only now and then, or in Python, stands in :meth:`Learner.update`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
 from sb3_dreamer_urlb.behavior.returns import lambda_return
+from sb3_dreamer_urlb.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.memory import keep_freed_memory
 from sb3_dreamer_urlb.numerical_faults import UpdateGuard
@@ -44,6 +46,7 @@ class LearnerConfig:
     precision: str = "float32"
     kl_scale: float = 1.0
     actor_gradient: str = DYNAMICS
+    compile: str = "eager"
 
 
 class Learner:
@@ -74,6 +77,12 @@ class Learner:
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
         self.guard = UpdateGuard(agent, self.optimizers())
+        #: what an update does on the device, recorded if that is wanted and possible
+        self.recorder: Recorder[Metrics] = Recorder(
+            self._update, make_backend(config.compile, self.device), self._memory, "The update"
+        )
+        if agent.intrinsic is not None and not agent.intrinsic.graph_safe:
+            self.recorder.give_up(f"{type(agent.intrinsic).__name__}.graph_safe is False")
 
     @property
     def device(self) -> th.device:
@@ -105,10 +114,30 @@ class Learner:
         :param batch: (B, T, …) on the agent's device
         :return: metrics, detached scalars on the device
         """
-        with self.guard.watching():
-            return self._update(batch)
+        metrics = self.recorder(batch, situation=self._situation())
+        self.guard.count()
+        if self.agent.trains_behavior() and self.updates % self.config.target_update_interval == 0:
+            self.agent.slow_critic.load_state_dict(self.agent.critic.state_dict())
+        self.updates += 1
+        return metrics
 
-    def _update(self, batch: SequenceBatch) -> Metrics:
+    def _situation(self) -> tuple[Hashable, ...]:
+        """What decides on the host which way an update goes."""
+        skills = self.agent.skills
+        return self.agent.trains_behavior(), skills is not None and skills.is_fixed
+
+    def _memory(self) -> Iterator[th.Tensor]:
+        """What an update reads and writes besides the batch."""
+        yield from memory_of(self.agent)
+        yield from self.guard.memory()
+        for optimizer in self.optimizers().values():
+            yield from optimizer.memory()
+
+    def _update(self, batch: SequenceBatch, generator: th.Generator | None = None, *situation: Hashable) -> Metrics:
+        with self.guard.watching():
+            return self._update_all(batch)
+
+    def _update_all(self, batch: SequenceBatch) -> Metrics:
         model = self.agent.world_model
         observation = model.preprocess(batch.observation)
         with self._products():
@@ -119,7 +148,6 @@ class Learner:
             metrics.update(self._update_behavior(posterior.state.detach(), batch.is_terminal))
             if self.agent.explores:
                 metrics["intrinsic_reward"] = metrics["imagined_reward"]
-        self.updates += 1
         return metrics
 
     def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
@@ -177,8 +205,6 @@ class Learner:
             value_now = agent.critic(imagination.feature[:-1].detach(), skill)
             critic_loss = agent.critic.loss(value_now, target.detach(), weight)
         critic_grad_norm = self.critic_optimizer.step(critic_loss)
-        if self.updates % config.target_update_interval == 0:
-            agent.slow_critic.load_state_dict(agent.critic.state_dict())
         return {
             **actor_critic.behavior_metrics(imagination, raw_reward, reward, returns),
             "actor_loss": loss.detach(),

@@ -60,11 +60,19 @@ class UpdateGuard:
             value.copy_(th.where(finite, value, old))
         # A part that had nothing to learn skipped nothing.
         flags = [self._good if o.skipped is None else o.skipped for o in self.optimizers.values()]
-        self.skipped = th.stack(flags)
+        self.skipped.copy_(th.stack(flags))
         bad = self.skipped.any()
-        self._in_a_row = (self._in_a_row + 1) * bad
-        self._total = self._total + bad
+        # In place: a recorded update (graphs.py) counts on.
+        self._in_a_row.add_(1).mul_(bad)
+        self._total.add_(bad)
+
+    def count(self) -> None:
+        """After an update, recorded or not."""
         self._since_check += 1
+
+    def memory(self) -> tuple[th.Tensor, ...]:
+        """All tensors that :meth:`watching` reads and writes, besides the agent's statistics."""
+        return self.skipped, self._good, self._in_a_row, self._total
 
     def _statistics(self) -> list[th.Tensor]:
         """What updates change without an optimiser."""

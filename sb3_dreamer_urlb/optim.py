@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch as th
@@ -23,22 +23,25 @@ class ClippedAdam:
         self, parameters: Iterable[nn.Parameter], learning_rate: float, eps: float, max_grad_norm: float, weight_decay: float
     ):
         self.parameters = list(parameters)
+        device = self.parameters[0].device if self.parameters else th.device("cpu")
         self.learning_rate = learning_rate
+        # On the device, so that a recorded step (graphs.py) follows a schedule, too.
+        self._rate = th.full((), learning_rate, device=device)
         self.eps = eps
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
         #: whether the last step was skipped, bool scalar on the device; whoever wants to know sets it to None before
         self.skipped: th.Tensor | None = None
-        self.adam = th.optim.AdamW(self.parameters, lr=learning_rate, eps=eps, weight_decay=0.0, fused=True)
-        self.set_learning_rate(learning_rate)
+        self._capturable = device.type == "cuda"
+        self.adam = th.optim.Adam(self.parameters, lr=self._rate, eps=eps, fused=True, capturable=self._capturable)
+        # torch would warn that a capturable optimiser is wasted on steps outside of a graph, which the first ones are.
+        self.adam._warned_capturable_if_run_uncaptured = True
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """Change the step size; the weight decay stays what it is (a step size of 0 stops both)."""
-        self.learning_rate = learning_rate
-        for group in self.adam.param_groups:
-            group["lr"] = learning_rate
-            # AdamW multiplies by (1 − lr · decay).
-            group["weight_decay"] = self.weight_decay / learning_rate if learning_rate > 0 else 0.0
+        if learning_rate != self.learning_rate:
+            self.learning_rate = learning_rate
+            self._rate.fill_(learning_rate)
 
     def step(self, loss: th.Tensor) -> th.Tensor:
         """Descend ``loss``; other parameters in its graph receive no gradient.
@@ -54,17 +57,29 @@ class ClippedAdam:
             parameter.grad = grad.contiguous()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.skipped = ~(norm.isfinite() & loss.detach().isfinite())
+        self._shrink(~self.skipped & (self._rate > 0))
+        self.restore_settings()
         # What torch's gradient scaler tells fused Adam by.
         self.adam.found_inf = self.skipped.float()  # type: ignore[attr-defined]
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         return norm
 
+    @th.no_grad()
+    def _shrink(self, steps: th.Tensor) -> None:
+        """The weight decay, where ``steps``, a bool scalar on the device, is true."""
+        th._foreach_mul_(tuple(self.parameters), 1 - self.weight_decay * steps.to(self._rate.dtype))
+
     def restore_settings(self) -> None:
         """Put the settings back that loading Adam's state replaced."""
         for group in self.adam.param_groups:
-            group["eps"] = self.eps
-        self.set_learning_rate(self.learning_rate)
+            group.update(lr=self._rate, eps=self.eps, weight_decay=0.0, capturable=self._capturable)
+
+    def memory(self) -> Iterator[th.Tensor]:
+        """All that a step reads and writes besides the parameters and the loss: moments and the step size."""
+        yield self._rate
+        for state in self.adam.state.values():
+            yield from state.values()
 
     def state_dict(self) -> dict[str, Any]:
         """Adam's moments and settings."""

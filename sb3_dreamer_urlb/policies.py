@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_dreamer_urlb import precision as precisions
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.observation_checks import checked_observation
@@ -28,6 +29,9 @@ from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 # Deterministic predictions draw their posterior states and planning noise from this seed, always the same.
 DETERMINISTIC_SEED = 0
+
+# Recordings of acting to keep at a time: one and ten environments, with and without exploration.
+KEPT_RECORDINGS = 4
 
 SelfDreamerPolicy = TypeVar("SelfDreamerPolicy", bound="DreamerPolicy")
 
@@ -74,6 +78,7 @@ class DreamerPolicy(BasePolicy):
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
     :param precision: of the planner's products, see :class:`~sb3_dreamer_urlb.DreamerV2`; all else here is float32
+    :param compile: of acting, see :class:`~sb3_dreamer_urlb.DreamerV2`
     :param normalize_images: False takes images of any dtype, scaled from their space's bounds instead of from [0, 255]
     :raises ValueError: for spaces or sizes that do not fit
     """
@@ -99,6 +104,7 @@ class DreamerPolicy(BasePolicy):
         planner: DynaMPC | None = None,
         planning: bool = True,
         precision: str = "float32",
+        compile: str = "eager",
         normalize_images: bool = True,
     ):
         super().__init__(observation_space, action_space, normalize_images=normalize_images)
@@ -134,6 +140,9 @@ class DreamerPolicy(BasePolicy):
         self.planner = planner
         self.planning = planning
         self.precision = precision
+        self.compile_mode = compile
+        self._recorders: tuple[Recorder[ActingState], Recorder[ActingState]] | None = None
+        self._recorders_device = th.device("cpu")
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
 
     @classmethod
@@ -155,7 +164,7 @@ class DreamerPolicy(BasePolicy):
         parameters.update(
             self._constructor_sizes, lr_schedule=self._dummy_schedule, planner=self.planner, planning=self.planning
         )
-        parameters.update(precision=self.precision)
+        parameters.update(precision=self.precision, compile=self.compile_mode)
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
 
@@ -213,6 +222,16 @@ class DreamerPolicy(BasePolicy):
         :param is_first: bool (n,), true where an episode begins
         :param generator: source of randomness
         """
+        if generator is not None and self.agent.skills is not None:
+            # The seed of the skill to draw is computed on the host.
+            return self._observe((observation, state, is_first), generator)
+        return self._recorded()[0]((observation, state, is_first), generator, (self._skill_is_fixed(),))
+
+    @th.no_grad()
+    def _observe(
+        self, seen: tuple[Observation, ActingState, th.Tensor], generator: th.Generator | None, *situation: Hashable
+    ) -> ActingState:
+        observation, state, is_first = seen
         model = self.agent.world_model
         embed = model.encoder(model.preprocess(observation))
         latent = model.rssm.posterior_step(state.latent, state.action, embed, is_first, generator)
@@ -242,11 +261,18 @@ class DreamerPolicy(BasePolicy):
         :param generator: source of randomness
         :return: the memory with the chosen action
         """
-        plan, skill = state.plan, state.skill
         if self.agent.acts_randomly():
             generator = self._moved_on(generator, state.steps)
             action = self.actions.random(len(state.action), generator, self.device)
-        elif self.planner is not None and self.planning:
+            return dataclasses.replace(state, action=action)
+        plans = self.planner is not None and self.planning
+        return self._recorded()[1](state, generator, (plans, deterministic))
+
+    @th.no_grad()
+    def _choose(self, state: ActingState, generator: th.Generator | None, plans: bool, deterministic: bool) -> ActingState:
+        plan, skill = state.plan, state.skill
+        if plans:
+            assert self.planner is not None
             with precisions.products(self.device, self.planner_dtype):
                 model = planned(self.agent, skill)
                 action, plan = self.planner.plan(model, state.latent, plan, generator, explore=not deterministic)
@@ -254,6 +280,27 @@ class DreamerPolicy(BasePolicy):
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mode if deterministic else policy.sample(generator)
         return dataclasses.replace(state, action=action, plan=plan)
+
+    # -- what acting does on the device, recorded if that is wanted and possible -------------------------------------------
+
+    def _recorded(self) -> tuple[Recorder[ActingState], Recorder[ActingState]]:
+        """Of :meth:`observe` and of :meth:`choose`; made anew where the networks moved to another device."""
+        if self._recorders is None or self._recorders_device != self.device:
+            self._recorders_device = self.device
+            backend = make_backend(self.compile_mode, self.device)
+            self._recorders = (
+                Recorder(self._observe, backend, self._acting_memory, "Observing", KEPT_RECORDINGS),
+                Recorder(self._choose, backend, self._acting_memory, "Choosing an action", KEPT_RECORDINGS),
+            )
+        return self._recorders
+
+    def _acting_memory(self) -> Iterator[th.Tensor]:
+        """What acting reads besides its inputs."""
+        agent = self.agent
+        yield from memory_of(agent.world_model, agent.actor, agent.slow_critic, agent.skills)
+
+    def _skill_is_fixed(self) -> bool:
+        return self.agent.skills is not None and self.agent.skills.is_fixed
 
     # -- SB3's interface -----------------------------------------------------------------------------------------------
 

@@ -71,6 +71,9 @@ class IntrinsicReward(RewardSource):
     ent_coef: ClassVar[float] = 0.0
     #: False: nothing for an actor to learn, pre-training acts uniformly at random
     trains_actor: ClassVar[bool] = True
+    #: False: something changes in Python from update to update, as a counter or a schedule, and a recorded update would not
+    #: see it (graphs.py); updates then run eager on CUDA, too
+    graph_safe: ClassVar[bool] = True
     #: the critic learns successor features ψ with value = ψ · w instead of values (APS)
     successor_features: ClassVar[bool] = False
 

@@ -135,7 +135,7 @@ class _Search:
         :return: indices (c, count), the particle itself first; and (c,) what the squared distances of all others reach
         """
         squares = self.left.new_empty(len(rows), max(self.n, self.groups * _GROUP))
-        squares[:, self.n :] = th.inf
+        squares[:, self.n :].fill_(th.inf)
         with th.autocast(squares.device.type, enabled=False):  # in bfloat16 it would find the wrong particles
             th.mm(self.left[rows], self.right, out=squares[:, : self.n])
         squares.scatter_(1, rows[:, None], -th.inf)

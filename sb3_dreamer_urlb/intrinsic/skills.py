@@ -91,8 +91,8 @@ class OneHotSkills(Skills):
         return F.one_hot(th.tensor(number), self.dim).to(self.fixed)
 
     def draw(self, n: int, generator: th.Generator | None = None) -> th.Tensor:
-        index = distributions.draw_classes(th.ones(n, self.dim, device=self.fixed.device), generator)
-        return F.one_hot(index, self.dim).to(self.fixed.dtype)
+        probs = self.fixed.new_ones(n, self.dim)
+        return distributions.one_hot_like(probs, distributions.draw_classes(probs, generator))
 
     def check(self, skill: th.Tensor) -> None:
         if not (((skill == 0) | (skill == 1)).all() and skill.sum() == 1):

@@ -164,14 +164,14 @@ class Classes(Vectors):
             raise UnsupportedSpaceError(f"SB3 takes MultiDiscrete observations of one dimension only, got {space}.")
         self.shape = space.shape
         self.classes = classes_of(space)
-        self.start = th.as_tensor(np.broadcast_to(space.start, self.shape).flatten().astype(np.int64))
+        self.start: list[int] = np.broadcast_to(space.start, self.shape).flatten().tolist()
         self.size = sum(self.classes)
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
         lead = raw.shape[: raw.dim() - len(self.shape)]
         numbers = raw.reshape(*lead, len(self.classes)).long()
-        return one_hot_numbers(numbers - self.start.to(raw.device), self.classes)
+        return one_hot_numbers(numbers, self.classes, self.start)
 
 
 #: what each space is to ``MlpPolicy``
