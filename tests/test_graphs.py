@@ -23,6 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_dreamer_urlb import DreamerV2, graphs, policies, precision
 from sb3_dreamer_urlb import learner as learner_module
+from sb3_dreamer_urlb.agent import PlannedAgent
 from sb3_dreamer_urlb.graphs import WARM_UPS, Recorder
 from sb3_dreamer_urlb.intrinsic import LBS
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
@@ -41,6 +42,8 @@ def taped(monkeypatch):
 
     for module in (learner_module, policies):
         monkeypatch.setattr(module, "make_backend", make)
+    # What plans on CUDA; a CPU's own form keeps weights where no tape can follow.
+    monkeypatch.setattr(policies, "planned", PlannedAgent)
 
 
 def with_skill(its, batch):
