@@ -84,6 +84,15 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         self.phase_frames += n_envs * self.action_repeat
         return self.policy.to_env_action(scaled), scaled
 
+    def forget_step(self) -> None:
+        """The step whose actions were chosen last came to no end: it does not count, and who goes on needs a reset.
+
+        Some of the environments may have made it, and nobody knows what came of it.
+        """
+        self.phase_timesteps -= self.n_envs
+        self.phase_frames -= self.n_envs * self.action_repeat
+        self._last_obs = None
+
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,

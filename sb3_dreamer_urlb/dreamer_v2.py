@@ -420,6 +420,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
+        :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
         with self.during_learn:
             if run_checkpoints.resume_if_asked(self, callback):
@@ -430,8 +431,8 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             callbacks.on_training_start(locals(), globals())
             try:
                 training_loop.learn(self, total_timesteps, callbacks, log_interval)
-            except EnvironmentFaultError as error:
-                raise EnvironmentFaultError(f"{error} {save_last_good_state(self)}") from error
+            except (EnvironmentFaultError, numerical_faults.NumericalFaultError) as error:
+                raise type(error)(f"{error} {save_last_good_state(self)}") from error
             callbacks.on_training_end()
             return self
 
@@ -459,7 +460,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
 
         :param gradient_steps: number of updates
         :param batch_size: B
-        :raises NumericalFaultError: if losses or gradients stay non-finite; the last good state is saved then
+        :raises NumericalFaultError: if losses or gradients stay non-finite
         """
         if not self.replay_buffer.can_sample():
             arguments.check_episode_length(self.replay_buffer)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_dreamer_urlb.agent import Agent
-from sb3_dreamer_urlb.last_state import save_last_good_state
 from sb3_dreamer_urlb.optim import ClippedAdam
 
 if TYPE_CHECKING:
@@ -94,15 +93,15 @@ class UpdateGuard:
 
 
 def stop_if_repeated(model: DreamerV2) -> None:
-    """End a run that no longer learns, after a last snapshot: the weights are those of the last good update.
+    """End a run that no longer learns: its weights are those of the last good update, and ``learn`` saves them.
 
     :param model: after its updates
-    :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts and the snapshot
+    :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts
     """
     parts = [name.removesuffix("_optimizer") for name in model.learner.guard.repeated()]
     if not parts:
         return
     raise NumericalFaultError(
         f"At step {model.num_timesteps}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
-        f"the {' and the '.join(parts)} was not finite. {save_last_good_state(model)} Smaller learning rates may help."
+        f"the {' and the '.join(parts)} was not finite. Smaller learning rates may help."
     )

@@ -118,8 +118,7 @@ class RunFolder:
         self.number, self.segments, self._buffer = number, segments, weakref.ref(buffer)
         self.identity = _identity(self.snapshot)
         self._remove_unnamed(open_name)
-        if buffer.disk is not None:
-            buffer.disk.release(buffer.evicted)
+        buffer.release()
 
     def _remove_unnamed(self, open_name: str | None) -> None:
         named = {open_name, *(segment.name for segment in self.segments)}

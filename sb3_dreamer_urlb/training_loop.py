@@ -31,11 +31,12 @@ class LearningVecEnv(VecEnvWrapper):
     :param venv: the environments
     :param update: what to do in that step
     :param overlap: do it after the actions are sent and before results are waited for; otherwise before they are sent
+    :param lost: told of a step that did not come to its end
     """
 
-    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool):
+    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool, lost: Callable[[], None]):
         super().__init__(venv)
-        self.update, self.overlap = update, overlap
+        self.update, self.overlap, self.lost = update, overlap, lost
         self.left: int | None = None
 
     def begin(self, steps: int | None) -> LearningVecEnv:
@@ -50,6 +51,14 @@ class LearningVecEnv(VecEnvWrapper):
     def reset(self) -> VecEnvObs:
         """As the environments'."""
         return self.venv.reset()
+
+    def step(self, actions: np.ndarray) -> VecEnvStepReturn:
+        """:raises Exception: of the update or the environments"""
+        try:
+            return super().step(actions)
+        except BaseException:
+            self.lost()
+            raise
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions."""
@@ -88,7 +97,7 @@ def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_i
         assert model.env is not None
         if env is None or env.venv is not model.env:
             # At first, and when a callback brought other environments.
-            env = LearningVecEnv(model.env, lambda: _update(model, ahead=model.n_envs), model.overlap)
+            env = LearningVecEnv(model.env, lambda: _update(model, ahead=model.n_envs), model.overlap, model.forget_step)
         rollout = model.collect_rollouts(
             env.begin(steps),
             callbacks,
@@ -118,10 +127,5 @@ def _update(model: DreamerV2, collected: int | None = None, ahead: int = 0) -> N
         assert isinstance(model.train_freq, TrainFreq)
         collected = model.train_freq.frequency * model.n_envs
     model._update_current_progress_remaining(model.num_timesteps + ahead, model._total_timesteps)
-    try:
-        model.train(model.gradient_steps if model.gradient_steps >= 0 else collected, model.batch_size)
-    except BaseException:
-        # A step that was sent is lost: whoever goes on with this model needs a reset.
-        model._last_obs = None
-        raise
+    model.train(model.gradient_steps if model.gradient_steps >= 0 else collected, model.batch_size)
     model.policy.set_training_mode(False)

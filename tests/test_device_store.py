@@ -8,6 +8,7 @@ import gc
 import os
 import pickle
 import threading
+import time
 import warnings
 import weakref
 
@@ -226,8 +227,27 @@ def test_what_the_thread_raises_comes_to_whoever_samples(tmp_path):
     with pytest.raises(ReplayStoreError, match="are missing"):
         buffer.sample(8)
     buffer.prefetch(8)
-    buffer.roll_back(0, {"finished_count": 0, "longest": 0})  # nobody wants it any more
+    buffer.roll_back(0, {"evicted": 0, "finished_count": 0, "longest": 0})  # nobody wants it any more
     assert not buffer.can_sample()
+
+
+def test_a_checkpoint_does_not_move_the_file_under_the_thread(tmp_path, monkeypatch):
+    """LMDB maps the file anew to remove what left: whoever reads meanwhile would read memory that is gone."""
+    buffer = filled(make_buffer(store="lmdb", path=tmp_path, prefetch=True)).buffer
+    reading, read, at_rest = threading.Event(), buffer.disk.read, []
+
+    def slow(*args):
+        reading.set()
+        time.sleep(0.02)
+        return read(*args)
+
+    monkeypatch.setattr(buffer.disk, "read", slow)
+    monkeypatch.setattr(buffer.disk, "release", lambda first: at_rest.append((first, buffer._prefetcher._pending)))
+    buffer.prefetch(8)
+    assert reading.wait(10) and buffer._prefetcher._pending is not None
+    buffer.release()
+    assert at_rest == [(buffer.evicted, None)]
+    buffer.close()
 
 
 def prefetching():

@@ -205,14 +205,19 @@ def test_many_in_a_row_end_the_run_with_a_snapshot(tiny_model, tmp_path):
     assert loaded._n_updates > model._n_updates
 
 
-def test_with_a_run_folder_the_last_good_state_is_its_checkpoint(tiny_model, tmp_path):
-    model = tiny_model(train_freq=1)
+@pytest.mark.parametrize("overlap", [True, False])
+def test_with_a_run_folder_the_last_good_state_is_its_checkpoint(tiny_model, tmp_path, overlap):
+    """The step that was under way during the last update is neither in it nor counted."""
+    model = tiny_model(CounterEnv(action_repeat=2), train_freq=1, overlap=overlap)
     spoil(model, 10, 10**9)
     with pytest.raises(NumericalFaultError, match=f"The last good state is in {tmp_path}"):
         model.learn(1000, callback=RunCheckpointCallback(tmp_path))
     assert model.checkpoint is None
-    resumed = DreamerV2.resume(tmp_path, CounterEnv(), device="cpu")
+    resumed = DreamerV2.resume(tmp_path, CounterEnv(action_repeat=2), device="cpu")
     assert resumed.num_timesteps == model.num_timesteps and resumed.replay_buffer.size() > 0
+    assert resumed.phase_timesteps == resumed.num_timesteps and resumed.phase_frames == 2 * resumed.num_timesteps
+    rows = sum(len(episode) - 1 for episode in resumed.replay_buffer.episodes)
+    assert rows == resumed.num_timesteps  # one a step, besides each episode's first
     resumed.learn(40, reset_num_timesteps=False)
     assert resumed.learner.guard.total() == 0
 

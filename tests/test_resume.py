@@ -285,6 +285,7 @@ def test_a_run_that_an_environment_ends_leaves_a_checkpoint(tiny_model, tmp_path
     assert isinstance(caught.value.__cause__, EnvironmentFaultError)
     resumed = DreamerV2.resume("run", CounterEnv(20), device="cpu")
     assert resumed.num_timesteps == 91 and resumed.env_faults == 1 and resumed._n_updates == model._n_updates > 0
+    assert resumed.phase_timesteps == resumed.phase_frames == 91  # the step that failed is none
     assert resumed.replay_buffer.finished_rows > 80
     weights = zip(model.policy.state_dict().values(), resumed.policy.state_dict().values(), strict=True)
     assert all(th.equal(mine, its) for mine, its in weights)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvW
 from test_run_folder import RepeatingEnv, everything, scramble
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback
-from sb3_dreamer_urlb.envs import SupervisedVecEnv
+from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard, SupervisedVecEnv
+from sb3_dreamer_urlb.envs.faults import FAULT
 
 
 class AnsweringEnv(CounterEnv):
@@ -313,15 +315,82 @@ def test_an_update_that_raises_leaves_the_environments_usable(tiny_model, monkey
         patch.setattr(model.learner, "update", lambda _: (_ for _ in ()).throw(error("no")))
         with pytest.raises(error, match="no"):
             model.learn(60, reset_num_timesteps=False)
+    goes_on(model)
+
+
+def goes_on(model):
+    """Check that a model whose step was lost goes on with whole episodes."""
+    assert model.phase_timesteps == model.num_timesteps
     before = model.replay_buffer.finished_count
     model.learn(60, reset_num_timesteps=False)
     assert model.replay_buffer.finished_count > before + 2
+    whole_episodes(model)
+
+
+def whole_episodes(model):
+    """Check that each row holds the action that its image answers."""
     for episode in model.replay_buffer.episodes:
         # Whole episodes of one environment each: the sum of actions grows as the images say.
         sums = np.abs(episode.action.astype(np.float64)).sum(1).cumsum()
         images = episode.observation[:, 0, 0, 0].astype(int)
         distance = np.abs((1000 * sums).astype(int) % 256 - images)
         assert np.minimum(distance, 256 - distance).max() <= 1
+
+
+class BreakingEnv(AnsweringEnv):
+    """Raises once, if asked to."""
+
+    broken = False
+
+    def step(self, action):
+        if self.broken:
+            self.broken = False
+            raise RuntimeError("broken")
+        return super().step(action)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_environments_that_stepped_beside_one_that_was_given_up_on(tiny_model, tmp_path):
+    """What they gave is lost, so that their episodes must not go on."""
+    envs = [FaultGuard(BreakingEnv(), max_faults=1), FaultGuard(BreakingEnv(), max_faults=1)]
+    model = tiny_model(DummyVecEnv([lambda: envs[0], lambda: envs[1]]), tensorboard_log=str(tmp_path)).learn(64)
+    envs[1].env.broken = True
+    with pytest.raises(EnvironmentFaultError, match="broken"):
+        model.learn(60, reset_num_timesteps=False)
+    goes_on(model)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("sign", "reason"), [(signal.SIGKILL, "ended by signal SIGKILL"), (signal.SIGSTOP, "no answer within 2 s")]
+)
+def test_a_process_that_dies_or_hangs_during_an_update_is_replaced(tiny_model, monkeypatch, sign, reason):
+    """The time limit begins when the update is over: one that takes longer makes no fault."""
+    env = SupervisedVecEnv([functools.partial(monitored, AnsweringEnv)] * 2, step_timeout=2.0)
+    try:
+        model = tiny_model(env)
+        update, reasons, updates = model.learner.update, [], []
+
+        def harmful(batch):
+            updates.append(model.num_timesteps)
+            if len(updates) == 2 and sign == signal.SIGSTOP:
+                time.sleep(2.2)
+            if len(updates) == 4:
+                os.kill(env.workers[1].process.pid, sign)
+            return update(batch)
+
+        def look(local, _):
+            reasons.extend((local["self"].num_timesteps, info[FAULT]) for info in local["infos"] if FAULT in info)
+            return True
+
+        monkeypatch.setattr(model.learner, "update", harmful)
+        model.learn(100, callback=look)
+    finally:
+        env.close()
+    [(step, text)] = reasons
+    # The answer may have been on its way already: then it is the next step that fails.
+    assert reason in text and step - updates[3] in (2, 4) and model.env_faults == 1 and len(updates) > 6
+    whole_episodes(model)
 
 
 def test_an_environment_that_dies_during_an_update(tiny_model):

@@ -185,6 +185,13 @@ class SequenceReplayBuffer(ReplayBuffer):
             )
         self._follow_disk()
 
+    def release(self) -> None:
+        """A checkpoint is complete: what left the store on disk before it may go from the file, too."""
+        if self.disk is not None:
+            # LMDB moves the file's memory for it, in which the thread may be reading.
+            self._prefetcher.discard()
+            self.disk.release(self.evicted)
+
     def size(self) -> int:
         """Rows held, those of open episodes included."""
         self.attach()
