@@ -226,7 +226,7 @@ def test_what_the_thread_raises_comes_to_whoever_samples(tmp_path):
     with pytest.raises(ReplayStoreError, match="are missing"):
         buffer.sample(8)
     buffer.prefetch(8)
-    buffer.roll_back(0, {"finished_count": 0, "longest": 0})  # nobody wants it any more
+    buffer.roll_back(0, {"evicted": 0, "finished_count": 0, "longest": 0})  # nobody wants it any more
     assert not buffer.can_sample()
 
 
