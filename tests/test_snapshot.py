@@ -579,7 +579,7 @@ def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
         del old["counters"][name]
     loaded = load(with_version(saved[1], tmp_path / "old.zip", 2, old))
     assert same(loaded, saved[0]) and [getattr(loaded, name) for name in new] == [0, 0, 0]
-    refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "env_faults")
+    refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "pretrained_frames")
 
 
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])
