@@ -62,6 +62,7 @@ bench: setup-gl  ## measure speed and memory on a CPU, ratios first, in under te
 	$(BIN)/python benchmarks/update.py --repeat 1 $(BENCH_ARGS)
 	$(BIN)/python benchmarks/planner.py --repeat 2 $(BENCH_ARGS)
 	$(BIN)/python benchmarks/replay.py $(BENCH_ARGS)
+	$(BIN)/python benchmarks/snapshot.py $(BENCH_ARGS)
 	$(BIN)/python benchmarks/collect.py --domains walker --environments 1 2 4 --repeat 2 $(BENCH_ARGS)
 	$(BIN)/python benchmarks/end_to_end.py --repeat 1 $(BENCH_ARGS)
 
