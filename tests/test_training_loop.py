@@ -362,7 +362,9 @@ def test_environments_that_stepped_beside_one_that_was_given_up_on(tiny_model, t
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize(
-    ("sign", "reason"), [(signal.SIGKILL, "ended by signal SIGKILL"), (signal.SIGSTOP, "no answer within 2 s")]
+    ("sign", "reason"),
+    [(signal.SIGKILL, "ended by signal SIGKILL"), (signal.SIGSTOP, "no answer within 2 s")],
+    ids=["dies", "hangs"],
 )
 def test_a_process_that_dies_or_hangs_during_an_update_is_replaced(tiny_model, monkeypatch, sign, reason):
     """The time limit begins when the update is over: one that takes longer makes no fault."""
