@@ -83,8 +83,10 @@ def test_rows_survive_the_process(tmp_path):
 def a_writer(path: str) -> None:
     """What the subprocess below does until it is killed."""
     buffer = on_disk(path, n_envs=3)
-    print("started", flush=True)
     streams = Streams(buffer, lambda e: ((7 * e) % 60 + 9, "truncated"))
+    while buffer.finished_count <= 40:
+        streams.step()
+    print("going", flush=True)
     while True:
         streams.step()
 
@@ -100,13 +102,13 @@ def test_kill_while_writing(tmp_path):
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment)
         process.stdout.readline()
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(generator.uniform(1.0, 2.0))
+            process.wait(generator.uniform(0.1, 1.0))
         process.send_signal(signal.SIGKILL)
         process.wait()
         buffer = on_disk(folder, n_envs=3)
         with pytest.warns(UserWarning, match="earlier run"):
             assert buffer.can_sample()
-        assert buffer.finished_count > 20 and buffer.finished_rows <= 1500
+        assert buffer.finished_count > 40 and buffer.finished_rows <= 1500
         check_rows(buffer.sample(200))
         for episode in buffer.episodes:
             numbers = episode.observation.reshape(len(episode), 4).astype(int)
