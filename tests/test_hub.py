@@ -93,6 +93,7 @@ def test_the_card_says_what_a_reader_wants_to_know(model, tmp_path):
         "| return | 4.50 +/- 0.00 (mean and standard deviation of 1 deterministic episodes) |",
         f"```sh\n{COMMAND}\n```",
         f"sb3_dreamer_urlb {sb3_dreamer_urlb.__version__}",
+        '"policy": "CnnPolicy"',
         '"preset": "tiny"',
     ):
         assert stated in text, stated
