@@ -56,6 +56,8 @@ class BoxActions(Actions):
     def to_env(self, action: np.ndarray) -> np.ndarray:
         space = self.space
         scaled = space.low + 0.5 * (action.reshape((-1, *space.shape)) + 1.0) * (space.high - space.low)
+        if np.issubdtype(space.dtype, np.integer):
+            scaled = np.rint(scaled)
         return np.clip(scaled, space.low, space.high).astype(space.dtype)
 
     def from_env(self, action: np.ndarray) -> np.ndarray:

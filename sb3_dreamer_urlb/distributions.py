@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
@@ -38,10 +37,12 @@ def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.
 
 def _draw_by_counting(probs: th.Tensor, generator: th.Generator | None) -> th.Tensor:
     """:func:`draw_classes` where the first dimension is innermost in memory: operations take one class of all rows at once."""
-    cdf = probs.movedim(0, -1).clone()  # (…, K, n)
-    by_class = cdf.unbind(-2)
-    for below, this in pairwise(by_class):
-        this.add_(below)
+    weights = probs.movedim(0, -1).unbind(-2)  # K of (…, n)
+    cdf = th.empty_like(probs.movedim(0, -1))
+    first, *others = by_class = cdf.unbind(-2)
+    first.copy_(weights[0])
+    for below, weight, this in zip(by_class, weights[1:], others, strict=False):
+        th.add(below, weight, out=this)
     bound = th.empty_like(by_class[-1]).uniform_(generator=generator).mul_(by_class[-1])
     # In place a comparison gives numbers, which are faster to count than booleans.
     return cdf.le_(bound.unsqueeze(-2)).sum(-2).clamp_(max=len(by_class) - 1).movedim(-1, 0).long()

@@ -9,7 +9,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.precision import full
 
 
@@ -31,7 +31,7 @@ class MLP(nn.Module):
     def hidden(self, x: th.Tensor) -> th.Tensor:
         """The last hidden layer, (…, inputs) → (…, net_arch[-1])."""
         for layer in self.dense:
-            x = elu(layer(x))
+            x = elu_(layer(x))
         return x
 
     def forward(self, x: th.Tensor) -> th.Tensor:

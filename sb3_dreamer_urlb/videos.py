@@ -98,7 +98,7 @@ class VideoCallback(BaseCallback):
             )
             return
         # Now, not after the first 50 000 steps.
-        recording.check_visible(self._dreamer, self._env())
+        recording.check_drawn(self._dreamer, self._env())
         self.last_filmed = self.num_timesteps
 
     def _on_step(self) -> bool:

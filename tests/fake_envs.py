@@ -11,6 +11,13 @@ import numpy as np
 from gymnasium import spaces
 
 
+class UndrawnEnv(gymnasium.Wrapper):
+    """Of a task whose drawing package is not installed, which gymnasium finds out when it draws."""
+
+    def render(self) -> Any:
+        raise gymnasium.error.DependencyNotInstalled("pygame is not installed")
+
+
 class CounterEnv(gymnasium.Env):
     """Pixels (0, 0) and (0, 1) hold the number of frames drawn since the environment was made, low byte first.
 

@@ -15,7 +15,7 @@ from snapshot_files import change_data
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import (
     DreamerV2,
@@ -92,12 +92,17 @@ def test_observation_spaces_of_other_policies(policy, space, message):
     ("space", "message"),
     [
         (_image(16, 16, 3, low=-np.inf, high=np.inf, dtype=np.float32), "Images need finite bounds"),
-        (_image(16, 16, 3, high=1, dtype=np.float32), "must have their channels first"),
+        (_image(16, 16, 3, high=1, dtype=np.float32), "must have their channels first.*or return uint8"),
         (_image(7, high=1, dtype=np.float32), "needs image observations"),
     ],
 )
 def test_float_images(refused, space, message):
     refused(message, CounterEnv(observation_space=space), policy_kwargs={"normalize_images": False})
+
+
+def test_normalised_images(refused):
+    """VecNormalize makes floats of uint8 images."""
+    refused(r"VecNormalize\(norm_obs=False\) for images", VecNormalize(DummyVecEnv([CounterEnv])))
 
 
 @pytest.mark.parametrize("error", [ValueError, AssertionError])

@@ -16,7 +16,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 
 import sb3_dreamer_urlb
-from sb3_dreamer_urlb import dreamer_v2, envs, planning
+from sb3_dreamer_urlb import dreamer_v2, envs, hub, planning
 from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.intrinsic import registry
 from sb3_dreamer_urlb.presets import PRESETS
@@ -187,7 +187,7 @@ def every_public_name_has_its_place(site):
     # Sphinx's inventory: four lines, then compressed ones, each beginning with a name.
     inventory = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode()
     documented = {line.split(" ")[0] for line in inventory.splitlines()}
-    for module in (sb3_dreamer_urlb, envs, planning):
+    for module in (sb3_dreamer_urlb, envs, planning, hub):
         assert not {f"{module.__name__}.{name}" for name in module.__all__} - documented
     methods = ("learn", "predict", "save", "load", "resume", "fine_tune")
     assert not {f"sb3_dreamer_urlb.DreamerV2.{name}" for name in methods} - documented

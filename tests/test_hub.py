@@ -16,7 +16,7 @@ import huggingface_hub
 import imageio.v2
 import numpy as np
 import pytest
-from fake_envs import CounterEnv
+from fake_envs import CounterEnv, UndrawnEnv
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from huggingface_hub.errors import RemoteEntryNotFoundError
@@ -93,6 +93,7 @@ def test_the_card_says_what_a_reader_wants_to_know(model, tmp_path):
         "| return | 4.50 +/- 0.00 (mean and standard deviation of 1 deterministic episodes) |",
         f"```sh\n{COMMAND}\n```",
         f"sb3_dreamer_urlb {sb3_dreamer_urlb.__version__}",
+        '"policy": "CnnPolicy"',
         '"preset": "tiny"',
     ):
         assert stated in text, stated
@@ -181,6 +182,9 @@ def test_without_pictures_there_is_no_film(tiny_model, tmp_path):
     blind = CounterEnv(8, observation_space=model.observation_space, render_mode=None)
     with pytest.warns(UserWarning, match=r"no replay\.mp4.*nothing to film"):
         package_to_hub(model, tmp_path, blind, n_eval_episodes=1, env_id=VECTORS)
+    undrawn = UndrawnEnv(CounterEnv(8, observation_space=model.observation_space))
+    with pytest.warns(UserWarning, match=r"no replay\.mp4.*pygame is not installed"):
+        package_to_hub(model, tmp_path, undrawn, n_eval_episodes=1, env_id=VECTORS)
     assert not (tmp_path / "replay.mp4").exists() and (tmp_path / "README.md").exists()
 
 

@@ -15,7 +15,7 @@ from torch import nn
 from sb3_dreamer_urlb import DreamerV2, memory, nets, precision
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.world_model import convolution, decoder, encoder, rssm
-from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, Phases
+from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, PatchesAndPhases, Phases
 
 
 @pytest.fixture
@@ -139,14 +139,38 @@ def test_every_form_equals_the_convolution(seeded, layer, size):
     assert all(th.allclose(a, b) for a, b in zip(*grads, strict=True))
 
 
-@pytest.mark.parametrize(("side", "form"), [(5, Patches), (6, Phases)])
+@pytest.mark.parametrize(
+    ("dtype", "side", "form"),
+    [
+        (th.float32, 5, Patches),
+        (th.float32, 6, Phases),
+        (th.bfloat16, 4, Patches),
+        (th.bfloat16, 5, PatchesAndPhases),
+        (th.bfloat16, 6, PatchesAndPhases),
+        (th.bfloat16, 7, Phases),
+    ],
+)
 @pytest.mark.parametrize("kernel", [5, 6])
-def test_transposed_convolutions_take_the_form_of_their_size(side, kernel, form):
-    found = convolution._form(nn.ConvTranspose2d(3, 5, kernel, 2), th.zeros(1, 3, side, side))
+def test_transposed_convolutions_take_the_form_of_their_size(dtype, side, kernel, form):
+    found = convolution._form(nn.ConvTranspose2d(3, 5, kernel, 2), th.zeros(1, 3, side, side), dtype)
     assert type(found) is (Direct if (kernel, form) == (5, Phases) else form)
 
 
-@pytest.mark.parametrize("form", [Direct, Patches, Phases])
+@pytest.mark.parametrize(
+    ("dtype", "side", "form"),
+    [
+        (th.float32, 12, Patches),
+        (th.float32, 14, type(None)),
+        (th.bfloat16, 10, Patches),
+        (th.bfloat16, 14, PatchesAndPhases),
+        (th.bfloat16, 16, type(None)),
+    ],
+)
+def test_convolutions_take_the_form_of_their_size(dtype, side, form):
+    assert type(convolution._form(nn.Conv2d(3, 5, 4, 2), th.zeros(1, 3, side, side), dtype)) is form
+
+
+@pytest.mark.parametrize("form", [Direct, Patches, PatchesAndPhases, Phases])
 def test_the_passes_of_a_form_work_for_both_kinds(seeded, form):
     """Also those that no layer of today uses."""
     its, weight = form(4, 2), th.randn(3, 5, 4, 4, dtype=th.float64, requires_grad=True)
@@ -156,6 +180,14 @@ def test_the_passes_of_a_form_work_for_both_kinds(seeded, form):
     assert th.allclose(its.gather(its.lay_out(wide), weight, None), narrow)
     assert th.allclose(its.weight(its.lay_out(wide), slope), *th.autograd.grad(narrow, weight, slope))
     assert th.allclose(its.scatter(slope, weight, None), nn.functional.conv_transpose2d(slope, weight, stride=2))
+
+
+@pytest.mark.parametrize(("kernel", "bias"), [(5, None), (5, th.randn(5)), (4, th.randn(5))])
+def test_phases_of_any_kernel(seeded, kernel, bias):
+    narrow, weight = th.randn(2, 3, 6, 6), th.randn(3, 5, kernel, kernel)
+    ours = PatchesAndPhases(kernel, 2).scatter(narrow, weight, bias)
+    theirs = nn.functional.conv_transpose2d(narrow, weight, bias, stride=2)
+    assert th.allclose(ours, theirs, atol=1e-5) and ours.is_contiguous(memory_format=th.channels_last)
 
 
 def test_large_images_and_inference_stay_with_the_layer(seeded):

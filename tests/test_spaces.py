@@ -45,6 +45,7 @@ ACTIONS = {
     "multi-discrete": spaces.MultiDiscrete([2, 4, 3]),
     "table": spaces.MultiDiscrete(np.array([[2, 3], [4, 2]])),
     "box": spaces.Box(-2, 5, (2, 3), np.float64),
+    "whole numbers": spaces.Box(0, 10, (2,), np.int32),
 }
 
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from fake_envs import CounterEnv
+from fake_envs import CounterEnv, UndrawnEnv
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from PIL import Image
@@ -74,7 +74,7 @@ def test_the_open_loop_film_shows_truth_model_and_error(tiny_model, tmp_path):
     [(_, frames)] = films(tmp_path)["video/open_loop"]
     truth, predicted, error = np.split(frames.astype(int), 3, 2)
     assert (predicted == 128).all()
-    counted = 7 * np.arange(9) % 256
+    counted = 7 * np.arange(1, 10) % 256  # picture 0 was the reset before the run, to see whether there are pictures
     assert np.abs(truth[:, 5, 5, 0] - counted).max() <= 4  # a palette has 256 colours
     assert np.abs(error[:, 5, 5, 0] - ((counted - 128) // 2 + 128)).max() <= 4
 
@@ -188,6 +188,7 @@ def test_what_cannot_be_filmed_is_refused_before_the_run(tiny_model, tmp_path):
         (tiny_model(blind, "MlpPolicy"), VideoCallback(blind, folder=tmp_path), "render_mode is None, not 'rgb_array'"),
         (tiny_model(), VideoCallback(folder=tmp_path), "has no registered id: give env"),
         (tiny_model(), VideoCallback(CounterEnv(size=20), folder=tmp_path), "does not fit the model"),
+        (tiny_model(), VideoCallback(UndrawnEnv(CounterEnv()), folder=tmp_path), "cannot be filmed: pygame is not installed"),
         (tiny_model(), VideoCallback(make_vec_env(CounterEnv, 2), folder=tmp_path), "One environment is needed"),
         (
             tiny_model(VecFrameStack(DummyVecEnv([lambda: gymnasium.make(ID)]), 2)),

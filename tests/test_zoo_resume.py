@@ -192,6 +192,9 @@ def test_mistakes_are_named(repeating, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["train", "--algo", "dreamerv2", "--env", STAND, "-i", str(tmp_path)])
     assert "is not the folder of a run: expected one as rl_zoo3 makes them" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        train(repeating, STAND, 60, "lbs", "-i", "logs/misspelt")
+    assert "-i logs/misspelt: there is none; expected the .zip of a snapshot, the folder of a run" in capsys.readouterr().err
     again = ["train", "--algo", "dreamerv2", "--env", STAND, "-i", str(run)]
     with RunFolder(run / "checkpoint").locked(), pytest.raises(RuntimeError, match="Another process is at work in"):
         repeating(*again)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 import torch as th
+from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
@@ -116,6 +117,19 @@ def check_visible(model: DreamerV2, env: VecEnv) -> None:
         )
 
 
+def check_drawn(model: DreamerV2, env: VecEnv) -> None:
+    """Draw once: whether an environment can, it only says when it is asked to. Resets it.
+
+    :param model: that is to play
+    :param env: to play in
+    :raises ValueError: if there is nothing to make pictures of, or what draws them is not installed
+    """
+    check_visible(model, env)
+    if env.render_mode == "rgb_array":
+        env.reset()
+        _rendered(env)
+
+
 @th.no_grad()
 def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = True) -> Recording:
     """Play one episode with the model's memory threaded through, with the planner if it is on.
@@ -124,7 +138,7 @@ def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = 
     :param env: see :func:`env_to_play_in`
     :param max_steps: agent steps at most
     :param deterministic: handed to ``predict``
-    :raises ValueError: if there is nothing to make pictures of
+    :raises ValueError: if there is nothing to make pictures of, or what draws them is not installed
     """
     check_visible(model, env)
     copy_statistics(model, env)
@@ -146,14 +160,21 @@ def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = 
 
 def _picture(model: DreamerV2, env: VecEnv, observation: Any) -> np.ndarray:
     if env.render_mode == "rgb_array":
-        rendered = env.get_images()[0]
-        assert rendered is not None
-        return np.asarray(rendered, np.uint8)
+        return _rendered(env)
     policy = model.policy
     image = image_of(policy.observations, policy.agent.world_model.preprocess(_stacked([observation])))
     assert image is not None
     shown: np.ndarray = pictures(image)[0]
     return shown
+
+
+def _rendered(env: VecEnv) -> np.ndarray:
+    try:
+        rendered = env.get_images()[0]
+    except DependencyNotInstalled as error:  # pygame, say
+        raise ValueError(f"The environment cannot be filmed: {error}") from error
+    assert rendered is not None
+    return np.asarray(rendered, np.uint8)
 
 
 def _batch_of_one(observation: np.ndarray | dict[str, np.ndarray]) -> Any:

@@ -246,7 +246,9 @@ def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
 def changed_arguments(model: DreamerV2) -> dict[str, Any]:
     """Constructor arguments that are not the defaults, as JSON."""
     signature = inspect.signature(type(model).__init__).parameters
-    found: dict[str, Any] = {"policy": type(model.policy).__name__}
+    kind = type(model.policy)
+    aliases = [alias for alias, known in model.policy_aliases.items() if known is kind]
+    found: dict[str, Any] = {"policy": (aliases or [kind.__name__])[0]}
     for name in argument_names(type(model)):
         if name in NOT_LISTED or name == "stats_window_size":
             continue

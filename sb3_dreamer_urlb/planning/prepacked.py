@@ -23,9 +23,17 @@ class PrepackedLinear:
         if th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight"):
             self.packed = th.ops.mkldnn._reorder_linear_weight(self.weight.contiguous(), None)
 
-    def __call__(self, x: th.Tensor) -> th.Tensor:
-        """(n, inputs) → (n, outputs), in the format of products."""
+    def __call__(self, x: th.Tensor, plus: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param x: (n, inputs), in the format of products
+        :param plus: added to the result in the same pass, (n, outputs)
+        :return: (n, outputs), in the format of products
+        """
         if self.packed is None:
-            return F.linear(x, self.weight, self.bias)
-        y: th.Tensor = th.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, "none", [], "")
+            y = F.linear(x, self.weight, self.bias)
+            return y if plus is None else y.add_(plus)
+        if plus is None:
+            y = th.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, "none", [], "")
+        else:
+            y = th.ops.mkldnn._linear_pointwise.binary(x, plus, self.packed, self.bias, "add")
         return y

@@ -127,7 +127,7 @@ class _Head:
 
     def __call__(self, classes: th.Tensor, rest: th.Tensor) -> th.Tensor:
         """Classes (n, S) and what else the first layer reads, (n, D) or with a skill (n, D + W) → float (n, outputs)."""
-        x = self.rest(rest).add_(F.embedding_bag(classes, self.rows, mode="sum"))
+        x = self.rest(rest, plus=F.embedding_bag(classes, self.rows, mode="sum"))
         for layer in self.layers:
             x = layer(elu_(x))
         return full(x)
@@ -149,7 +149,7 @@ class _Dynamics:
         # A constant for each variable changes no probability: logits whose mean is 0 need no search for their largest.
         weight = rssm.prior_logits.weight.view(*self.shape, -1)
         bias = rssm.prior_logits.bias.view(self.shape)
-        self.logits_weight = (weight - weight.mean(1, keepdim=True)).to(dtype)
+        self.logits_weight = (weight - weight.mean(1, keepdim=True)).flatten(0, 1).to(dtype)
         self.logits_bias = (bias - bias.mean(1, keepdim=True)).unsqueeze(-1)
         self.first_class = th.arange(0, rssm.stoch_size, self.shape[1])
         self._start: LatentState | None = None
@@ -159,7 +159,7 @@ class _Dynamics:
             stoch_part, short = self._start_part(state), state.deter.to(self.dtype)
         else:
             stoch_part, short = F.embedding_bag(state.classes, self.rows, mode="sum"), state.short
-        x = elu_(self.action(action.to(self.dtype)).add_(stoch_part))
+        x = elu_(self.action(action.to(self.dtype), plus=stoch_part))
         deter = self._recur(th.cat([x, short], -1), state.deter)
         short = deter.to(self.dtype)
         return SampledState(self._draw(short, generator), deter, short, self.stoch_size)
@@ -177,17 +177,14 @@ class _Dynamics:
         return th.lerp(deter, reset.mul(parts[:, 2 * size :]).tanh_(), update)
 
     def _draw(self, short: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """Classes lie outermost in memory: what is done for each class runs over all states at once."""
         hidden = elu_(self.hidden(short)).T
-        parts = zip(self.logits_weight.split(BLOCK), self.logits_bias.split(BLOCK), strict=True)
-        drawn = [self._draw_block(hidden, weight, bias, generator) for weight, bias in parts]
+        logits = (self.logits_weight @ hidden).view(*self.shape, -1)  # (S, K, n)
+        drawn = []
+        for block, bias in zip(logits.split(BLOCK), self.logits_bias.split(BLOCK), strict=True):
+            probs = block.float().add_(bias).clamp_(max=MAX_LOGIT).exp_().movedim(-1, 0)
+            drawn.append(distributions.draw_classes(probs, generator))
         return th.cat(drawn, 1).add_(self.first_class)
-
-    @staticmethod
-    def _draw_block(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, generator: th.Generator | None) -> th.Tensor:
-        """Some variables. Classes lie outermost in memory: what is done for each class runs over all states at once."""
-        logits = (weight.flatten(0, 1) @ hidden).view(*weight.shape[:2], -1).float()  # (variables, K, n)
-        probs = logits.add_(bias).clamp_(max=MAX_LOGIT).exp_().movedim(-1, 0)
-        return distributions.draw_classes(probs, generator)
 
 
 def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[PrepackedLinear, tuple[th.Tensor, th.Tensor]]:

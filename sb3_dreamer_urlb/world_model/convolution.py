@@ -23,11 +23,13 @@ from torch import nn
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, Phases
+from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
-#: Pixels a side of the narrow image up to which the passes are products on CPU: the last convolution and the second
-#: transposed one at 64×64. Measured layer by layer, in float32 and bfloat16 (docs/performance.md).
-SMALL_SIDE = 5
+#: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
+#: float32, the second transposed one. Measured layer by layer (docs/performance.md).
+SMALL_SIDE = {th.float32: 5, th.bfloat16: 4}
+#: The same for products with one pass as phases: the third convolution and the second transposed one in bfloat16.
+MIDDLE_SIDE = {th.float32: 0, th.bfloat16: 6}
 
 
 def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
@@ -36,11 +38,13 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     :param layer: square stride, no padding
     :param x: (N, C, height, width)
     """
-    form = _form(layer, x) if x.device.type == "cpu" and th.is_grad_enabled() else None
+    if x.device.type != "cpu" or not th.is_grad_enabled():
+        return layer(x)
+    dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
+    form = _form(layer, x, dtype)
     if form is None:
         return layer(x)
     assert layer.bias is not None
-    dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
     # Outside of the function, so that autograd brings the gradients back to float32.
     weight, bias = layer.weight.to(dtype), layer.bias.to(dtype)
     with th.autocast("cpu", enabled=False):
@@ -48,14 +52,16 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
         return _Convolution.apply(x.to(dtype), weight, bias, form, transposed)  # type: ignore[no-untyped-call]
 
 
-def _form(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> Form | None:
-    """None where the layer itself is as good."""
+def _form(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, dtype: th.dtype) -> Form | None:
+    """For passes in ``dtype``. None where the layer itself is as good."""
     kernel, stride, transposed = layer.kernel_size[0], layer.stride[0], isinstance(layer, nn.ConvTranspose2d)
     if x.shape[-1] != x.shape[-2] or kernel != layer.kernel_size[1]:
         return None
     side = x.shape[-1] if transposed else (x.shape[-1] - kernel) // stride + 1
-    if side <= SMALL_SIDE:
+    if side <= SMALL_SIDE.get(dtype, SMALL_SIDE[th.float32]):
         return Patches(kernel, stride)
+    if side <= MIDDLE_SIDE.get(dtype, 0):
+        return PatchesAndPhases(kernel, stride)
     if not transposed:
         return None
     return Phases(kernel, stride) if kernel % stride == 0 else Direct(kernel, stride)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
@@ -60,10 +60,10 @@ class ConvDecoder(nn.Module):
         :param feature: float (…, F)
         :return: mean image, float (…, C, height, width)
         """
-        x = elu(self._grow(self.input(feature.flatten(0, -2))))
+        x = elu_(self._grow(self.input(feature.flatten(0, -2))))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
-            x = elu(convolve(deconv, x))
+            x = elu_(convolve(deconv, x))
         return full(x).reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
@@ -32,7 +32,7 @@ class ConvEncoder(Encoder):
     :param activation: after each convolution
     """
 
-    def __init__(self, image_shape: tuple[int, int, int], depth: int, activation: Callable[[th.Tensor], th.Tensor] = elu):
+    def __init__(self, image_shape: tuple[int, int, int], depth: int, activation: Callable[[th.Tensor], th.Tensor] = elu_):
         super().__init__()
         self.activation = activation
         channels, height, width = image_shape
@@ -70,7 +70,7 @@ class VectorEncoder(MLP, Encoder):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """(…, size) → (…, E)."""
-        return elu(super().forward(x))
+        return elu_(super().forward(x))
 
 
 class DictEncoder(Encoder):

@@ -71,9 +71,9 @@ class Images(Observations):
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Box) or not is_image_space(space, normalized_image=not normalize_images):
             raise UnsupportedSpaceError(
-                "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), or floats with "
-                f'policy_kwargs={{"normalize_images": False}}, got {space}. Use "MlpPolicy" for vectors; for dm_control '
-                "tasks use gymnasium.make('urlb/<domain>-<task>-v0')."
+                "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), or floats, channels "
+                f'first, with policy_kwargs={{"normalize_images": False}}, got {space}. Use "MlpPolicy" for vectors, and '
+                "VecNormalize(norm_obs=False) for images; for dm_control tasks gymnasium.make('urlb/<domain>-<task>-v0')."
             )
         low, high = float(space.low.min()), float(space.high.max())
         if not np.isfinite([low, high]).all():
@@ -81,7 +81,8 @@ class Images(Observations):
         least, most = IMAGE_SIZES
         if not is_image_space_channels_first(space):
             raise UnsupportedSpaceError(
-                f"Images must have their channels first (SB3 transposes an environment's uint8 images only), got {space}."
+                f"Images must have their channels first (SB3 transposes an environment's uint8 images only), got {space}. "
+                "Let the environment put the channels first, or return uint8 in [0, 255]."
             )
         channels, height, width = space.shape
         if not (least <= height <= most and least <= width <= most):

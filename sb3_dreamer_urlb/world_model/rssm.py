@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.activation import elu
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
 
@@ -138,7 +138,7 @@ class RSSM(nn.Module):
     def _recur(self, state: LatentState, action_part: th.Tensor, stoch_part: th.Tensor | None = None) -> th.Tensor:
         if stoch_part is None:
             stoch_part = F.linear(state.stoch, self.input.weight[:, : self.stoch_size])
-        x = elu(stoch_part + action_part)
+        x = elu_(stoch_part + action_part)
         parts = self.gru_norm(full(self.gru(th.cat([x, state.deter], -1))))
         reset, candidate, update = parts.chunk(3, -1)
         candidate = th.tanh(th.sigmoid(reset) * candidate)
@@ -146,11 +146,11 @@ class RSSM(nn.Module):
         return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
 
     def _prior(self, deter: th.Tensor) -> th.Tensor:
-        logits = self.prior_logits(elu(self.prior_hidden(deter)))
+        logits = self.prior_logits(elu_(self.prior_hidden(deter)))
         return full(logits).view(deter.shape[:-1] + self.logits_shape)
 
     def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
-        hidden = elu(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
+        hidden = elu_(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
         return full(self.post_logits(hidden)).view(deter.shape[:-1] + self.logits_shape)
 
     @staticmethod

@@ -96,6 +96,8 @@ def with_runs(parse: Callable[..., argparse.Namespace]) -> Callable[..., argpars
         if given == AUTO:
             options.trained_agent, options.resume = "", AUTO
             return options
+        if given and not os.path.exists(given):
+            parser.error(f"-i {given}: there is none; expected the .zip of a snapshot, the folder of a run, or 'auto'")
         try:
             run = run_at(given)
             before = {} if run is None else saved(run, "args")
