@@ -189,8 +189,10 @@ class Learner:
             imagination, log_prob = self._imagine(start, skill)
             raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
             reward = agent.reward_normalizer(raw_reward)
+            # Once for both critics.
+            feature = imagination.feature.to(self.dtype)
             discount = agent.world_model.discount(imagination.feature, goes_on)
-            value = agent.slow_critic(imagination.feature, skill)
+            value = agent.slow_critic(feature, skill)
             weight = actor_critic.discount_weights(discount.detach())
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
@@ -202,7 +204,7 @@ class Learner:
                 loss = actor_critic.reinforce_loss(target, value, chosen, log_prob, imagination.entropy, config.ent_coef)
         actor_grad_norm = self.actor_optimizer.step(loss)
         with self._products():
-            value_now = agent.critic(imagination.feature[:-1].detach(), skill)
+            value_now = agent.critic(feature[:-1].detach(), skill)
             critic_loss = agent.critic.loss(value_now, target.detach(), weight)
         critic_grad_norm = self.critic_optimizer.step(critic_loss)
         return {

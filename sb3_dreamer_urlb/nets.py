@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb.activation import elu_
+from sb3_dreamer_urlb.dense import linear
 from sb3_dreamer_urlb.precision import full
 
 
@@ -31,7 +32,8 @@ class MLP(nn.Module):
     def hidden(self, x: th.Tensor) -> th.Tensor:
         """The last hidden layer, (…, inputs) → (…, net_arch[-1])."""
         for layer in self.dense:
-            x = elu_(layer(x))
+            assert isinstance(layer, nn.Linear)
+            x = elu_(linear(x, layer.weight, layer.bias))
         return x
 
     def forward(self, x: th.Tensor) -> th.Tensor:

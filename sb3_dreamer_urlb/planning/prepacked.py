@@ -29,6 +29,7 @@ class PrepackedLinear:
         :param plus: added to the result in the same pass, (n, outputs)
         :return: (n, outputs), in the format of products
         """
+        y: th.Tensor
         if self.packed is None:
             y = F.linear(x, self.weight, self.bias)
             return y if plus is None else y.add_(plus)

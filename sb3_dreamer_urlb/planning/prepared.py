@@ -27,7 +27,7 @@ from sb3_dreamer_urlb.world_model.rssm import RSSM
 #: of a logit above its variable's mean, so that exp stays finite; another class this far above would be drawn as often
 MAX_LOGIT = 80.0
 #: variables drawn at once, and states scored at once: what a processor's cache holds
-BLOCK, ROWS = 8, 2560
+BLOCK, ROWS = 8, 8192
 
 
 @dataclass

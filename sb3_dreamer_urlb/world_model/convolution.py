@@ -23,6 +23,7 @@ from torch import nn
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from sb3_dreamer_urlb.dense import column_sums
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
@@ -94,4 +95,5 @@ class _Convolution(Function):
             x_grad = F.pad(x_grad, (0, unseen, 0, unseen)) if unseen else x_grad
         if wants_weight:
             weight_grad = form.weight(wide, narrow)
-        return x_grad, weight_grad, grad.sum((0, 2, 3)) if wants_bias else None, None, None
+        bias_grad = column_sums(grad.permute(0, 2, 3, 1).flatten(0, 2)) if wants_bias else None
+        return x_grad, weight_grad, bias_grad, None, None

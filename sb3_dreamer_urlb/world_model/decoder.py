@@ -9,6 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb.activation import elu_
+from sb3_dreamer_urlb.dense import linear
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve
@@ -60,7 +61,7 @@ class ConvDecoder(nn.Module):
         :param feature: float (…, F)
         :return: mean image, float (…, C, height, width)
         """
-        x = elu_(self._grow(self.input(feature.flatten(0, -2))))
+        x = elu_(self._grow(linear(feature.flatten(0, -2), self.input.weight, self.input.bias)))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
             x = elu_(convolve(deconv, x))
@@ -72,8 +73,8 @@ class ConvDecoder(nn.Module):
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
         # Channels last, as all that follow.
-        y = (x @ first.weight.permute(0, 2, 3, 1).reshape(channels, -1)).view(-1, height, width, out)
-        return (y + first.bias.to(y.dtype)).permute(0, 3, 1, 2)
+        weight = first.weight.permute(0, 2, 3, 1).reshape(channels, -1).T
+        return linear(x, weight, first.bias.repeat(height * width)).view(-1, height, width, out).permute(0, 3, 1, 2)
 
 
 class VectorDecoder(MLP):
