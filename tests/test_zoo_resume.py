@@ -250,6 +250,17 @@ def test_monitor_files_lose_what_came_after_the_checkpoint(tmp_path):
     assert kept["r"].tolist() == [1.0, 2.0] and kept["t"].tolist() == [3.5, 999.0]
 
 
+def test_monitor_files_of_two_tries_from_one_checkpoint_are_all_kept(tmp_path):
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint" / "snapshot.zip").touch()
+    os.utime(tmp_path / "checkpoint" / "snapshot.zip", (2000, 2000))
+    for reward in (1.0, 2.0, 3.0):
+        (tmp_path / "0.monitor.csv").write_text(f"#{json.dumps({'t_start': 1000.0})}\nr,l,t\n{reward},20,3.5\n")
+        resuming.put_monitor_files_aside(tmp_path)
+    files = sorted(tmp_path.glob("*.monitor.csv"))
+    assert sorted(pandas.read_csv(file, skiprows=1)["r"].item() for file in files) == [1.0, 2.0, 3.0]
+
+
 # -- trials that learn nothing ---------------------------------------------------------------------------------------------
 
 

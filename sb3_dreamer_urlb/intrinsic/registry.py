@@ -64,7 +64,12 @@ def make_intrinsic_reward(
         raise ValueError(
             f"intrinsic_reward must be a name, a subclass or an instance of IntrinsicReward, or None, got {method!r}."
         )
-    known = set(inspect.signature(chosen).parameters)
+    # A class without a constructor of its own shows nn.Module's *args and **kwargs.
+    known = {
+        name
+        for name, one in inspect.signature(chosen).parameters.items()
+        if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+    }
     unknown = sorted(set(kwargs) - known)
     if unknown:
         raise ValueError(f"Unknown intrinsic_kwargs {unknown} for {method!r}; known are {sorted(known)}.")

@@ -112,6 +112,7 @@ def blank(
     if unknown:
         raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
     given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
+    _check_method(arguments, given)
     decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
     for name, value in decoded.items():
         if (missing := values.contains_custom(value)) is not None:
@@ -134,6 +135,13 @@ def blank(
     model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
     model.preset = preset
     return model
+
+
+def _check_method(stored: dict[str, Any], given: dict[str, Any]) -> None:
+    """A model is what it learnt with; of a class, only the networks can tell."""
+    was, wanted = values.decode(stored.get("intrinsic_reward")), given.get("intrinsic_reward")
+    if "intrinsic_reward" in given and all(one is None or isinstance(one, str) for one in (was, wanted)) and was != wanted:
+        raise ValueError(f"intrinsic_reward must be {was!r}, with which the model was trained, got {wanted!r}.")
 
 
 def needed(data: dict[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import itertools
 import json
 import os
 from collections.abc import Callable
@@ -176,4 +177,10 @@ def put_monitor_files_aside(run: Path) -> None:
         writer.writerows(row for row in reader if row["t"] and start + float(row["t"]) <= until)
         with written_atomically(file) as target:
             target.write(f"{header}\n{kept.getvalue()}".encode())
-        file.rename(run / f"{number}.before_{int(until)}.monitor.csv")
+        file.rename(_unused(run, f"{number}.before_{int(until)}"))
+
+
+def _unused(run: Path, name: str) -> Path:
+    """Whoever goes on twice from one checkpoint has two files to put aside."""
+    names = (f"{name}{again}.monitor.csv" for again in itertools.chain([""], (f"_{i}" for i in itertools.count(2))))
+    return next(run / free for free in names if not (run / free).exists())
