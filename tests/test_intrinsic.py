@@ -348,6 +348,7 @@ def test_an_instance_is_a_template(tiny_model):
     [
         ("apd", None, r"Unknown intrinsic_reward 'apd'; known are .*'aps', 'apt'.*None"),
         ("apt", {"neighbours": 3}, r"Unknown intrinsic_kwargs \['neighbours'\] for 'apt'; known are \['k'\]"),
+        ("lbs", {"gain": 2}, r"Unknown intrinsic_kwargs \['gain'\] for 'lbs'; known are \[\]"),
         (None, {"k": 3}, r"intrinsic_kwargs=\{'k': 3\} need the name or the class"),
         ("apt", ["k"], r"intrinsic_kwargs must be a dictionary or None, got \['k'\]"),
         ("diayn", {"skill_dim": 1}, "skill_dim must be an integer of at least 2, got 1"),

@@ -800,3 +800,11 @@ def test_a_full_device(saved, tmp_path):
     (tmp_path / "m.zip").mkdir()
     with pytest.raises(OSError, match=r"intact.*m\.zip"):
         saved[0].save(tmp_path / "m.zip")
+
+
+@pytest.mark.parametrize("method", ["icm", None])
+def test_a_model_keeps_the_method_it_learnt_with(saved, method):
+    with pytest.raises(ValueError, match="intrinsic_reward must be 'lbs', with which the model was trained") as caught:
+        load(saved[1], intrinsic_reward=method)
+    assert not isinstance(caught.value, SnapshotError)
+    assert same(load(saved[1], intrinsic_reward="lbs"), saved[0])
