@@ -63,6 +63,7 @@ def settings(task: str) -> tuple[int, dict[str, Any]]:
     entry = dict(yaml.safe_load(CONFIG.read_text())[task])
     # rl_zoo3's "normalize" is SB3's VecNormalize, see learn().
     assert entry.pop("normalize") is True
+    del entry["checkpoint"]  # the zoo's
     return entry.pop("n_timesteps"), entry
 
 

@@ -130,6 +130,7 @@ def test_the_file_for_vectors():
     for task, entry in read.items():
         entry = dict(entry)
         assert entry.pop("n_timesteps") <= 50_000 and entry.pop("normalize") is True and entry["preset"] == "vector"
+        assert entry.pop("checkpoint") == {"every_frames": 1000}
         for value in leaves(entry):
             assert not (isinstance(value, str) and re.fullmatch(r"[-+\d.eE]+", value)), value
         model = DreamerV2(env=gymnasium.make(task), device="cpu", **entry)
