@@ -22,47 +22,36 @@ SMALLEST = 2**16
 PIECE = 2**17
 
 
-def elu(x: th.Tensor) -> th.Tensor:
+def elu_(x: th.Tensor) -> th.Tensor:
     """x where positive, exp(x) − 1 elsewhere, elementwise.
 
-    :param x: float tensor of any shape; never changed
-    """
-    if not _cheaper(x):
-        return F.elu(x)
-    if not _learns(x):
-        return _in_pieces(x, th.empty_like(x))
-    y: th.Tensor = _ELU.apply(x, False)  # type: ignore[no-untyped-call]
-    return y
-
-
-def elu_(x: th.Tensor) -> th.Tensor:
-    """:func:`elu` that may overwrite its input, which nobody may need afterwards: neither the caller nor a gradient.
+    May overwrite its input, which nobody may need afterwards: neither the caller nor a gradient.
 
     :param x: float tensor of any shape
     """
     if not _cheaper(x):
         return F.elu(x) if _learns(x) else F.elu_(x)
     if not _learns(x):
-        return _in_pieces(x, x)
-    y: th.Tensor = _ELU.apply(x, True)  # type: ignore[no-untyped-call]
+        return _in_pieces(x)
+    y: th.Tensor = _ELU.apply(x)  # type: ignore[no-untyped-call]
     return y
 
 
 class _ELU(Function):
     @staticmethod
-    def forward(ctx: th.autograd.function.FunctionCtx, x: th.Tensor, overwrite: bool) -> th.Tensor:
+    def forward(ctx: th.autograd.function.FunctionCtx, x: th.Tensor) -> th.Tensor:
         # Not ctx.mark_dirty: autograd refuses to overwrite what another Function gave out as a view. Hence nobody checks that
         # the input is not needed any more.
-        y = _in_pieces(x, x.data if overwrite else th.empty_like(x))
+        y = _in_pieces(x.data)
         ctx.save_for_backward(y)
         return y
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
+    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> th.Tensor:
         (y,) = ctx.saved_tensors  # type: ignore[attr-defined]
         slope: th.Tensor = th.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, y)
-        return slope, None
+        return slope
 
 
 def _learns(x: th.Tensor) -> bool:
@@ -76,21 +65,18 @@ def _cheaper(x: th.Tensor) -> bool:
     return x.is_contiguous() or (x.dim() == 4 and x.is_contiguous(memory_format=th.channels_last))
 
 
-def _in_pieces(x: th.Tensor, y: th.Tensor) -> th.Tensor:
-    """
-    :param x: numbers
-    :param y: where their ELU goes; laid out as ``x``, or ``x`` itself
-    """
+def _in_pieces(x: th.Tensor) -> th.Tensor:
+    """ELU in place."""
     bits = BITS[x.dtype]
     # In the order of memory.
-    source, target = (t.as_strided((t.numel(),), (1,)) for t in (x, y))
+    flat = x.as_strided((x.numel(),), (1,))
     work = th.empty(min(PIECE, x.numel()), dtype=th.float32)
     short = work if x.dtype == th.float32 else th.empty_like(work, dtype=x.dtype)
-    for numbers, out in zip(source.split(PIECE), target.view(bits).split(PIECE), strict=True):
+    for numbers in flat.split(PIECE):
         part, result = work[: numbers.numel()], short[: numbers.numel()]
         if short is work:
             th.exp(numbers, out=part).sub_(1)
         else:
             result.copy_(part.copy_(numbers).exp_().sub_(1))
-        th.minimum(numbers.view(bits), result.view(bits), out=out)
-    return y
+        th.minimum(numbers.view(bits), result.view(bits), out=numbers.view(bits))
+    return x

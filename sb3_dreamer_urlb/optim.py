@@ -58,7 +58,9 @@ class ClippedAdam:
         norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.skipped = ~(norm.isfinite() & loss.detach().isfinite())
         self._shrink(~self.skipped & (self._rate > 0))
-        self.restore_settings()
+        for group in self.adam.param_groups:
+            # Whoever loads Adam's state replaces its settings, too.
+            group.update(lr=self._rate, eps=self.eps, weight_decay=0.0, capturable=self._capturable)
         # What torch's gradient scaler tells fused Adam by.
         self.adam.found_inf = self.skipped.float()  # type: ignore[attr-defined]
         self.adam.step()
@@ -69,11 +71,6 @@ class ClippedAdam:
     def _shrink(self, steps: th.Tensor) -> None:
         """The weight decay, where ``steps``, a bool scalar on the device, is true."""
         th._foreach_mul_(tuple(self.parameters), 1 - self.weight_decay * steps.to(self._rate.dtype))
-
-    def restore_settings(self) -> None:
-        """Put the settings back that loading Adam's state replaced."""
-        for group in self.adam.param_groups:
-            group.update(lr=self._rate, eps=self.eps, weight_decay=0.0, capturable=self._capturable)
 
     def memory(self) -> Iterator[th.Tensor]:
         """All that a step reads and writes besides the parameters and the loss: moments and the step size."""

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from sb3_dreamer_urlb import run_folder
 from sb3_dreamer_urlb.evaluation import history
 from sb3_dreamer_urlb.run_folder import RunFolder
-from sb3_dreamer_urlb.snapshots.model_data import ATTRIBUTES, describe_arguments
+from sb3_dreamer_urlb.snapshots.model_data import argument, describe_arguments
 from sb3_dreamer_urlb.snapshots.values import contains_custom, decode
 
 if TYPE_CHECKING:
@@ -161,10 +161,6 @@ def resume_if_asked(model: DreamerV2, callback: Any) -> bool:
     return True
 
 
-def _argument(model: DreamerV2, name: str) -> Any:
-    return getattr(model, ATTRIBUTES.get(name, name))
-
-
 def _flat(callback: Any) -> list[BaseCallback]:
     if isinstance(callback, list | tuple):
         return [one for inner in callback for one in _flat(inner)]
@@ -181,7 +177,7 @@ def _go_on(model: DreamerV2, folder: Path) -> bool:
     if model.phase_timesteps > 0:
         return False  # it has a life of its own
     arguments = describe_arguments(model)
-    given = {name: _argument(model, name) for name, value in arguments.items() if contains_custom(decode(value)) is not None}
+    given = {name: argument(model, name) for name, value in arguments.items() if contains_custom(decode(value)) is not None}
     own = {"verbose": model.verbose, "tensorboard_log": model.tensorboard_log}
     options = {"device": model.device, "print_system_info": False, "kwargs": own}
     found = run_folder.resume(type(model), folder, model.get_env(), custom_objects=given, **options)
@@ -190,7 +186,7 @@ def _go_on(model: DreamerV2, folder: Path) -> bool:
     for name, value in describe_arguments(found).items():
         if value != arguments[name]:
             raise ValueError(
-                f"The run in {folder} has {name}={_argument(found, name)!r}, the model {_argument(model, name)!r}: with "
+                f"The run in {folder} has {name}={argument(found, name)!r}, the model {argument(model, name)!r}: with "
                 "resume='auto' a run keeps its arguments. DreamerV2.resume(folder, env, ...) takes others."
             )
     # Everything is the run's, but for what belongs to this call of learn.

@@ -136,12 +136,9 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         :raises SnapshotError: if the file is damaged, does not fit the model, or was filled in another phase; the model
             keeps its own then
         """
-        buffer = self._new_replay_buffer()
+        buffer = _whole(self)._new_replay_buffer()
         replay_snapshot.load(buffer, path)
         self.replay_buffer = buffer
-
-    def _new_replay_buffer(self) -> SequenceReplayBuffer:
-        raise NotImplementedError
 
 
 def _whole(part: SavingAlgorithm) -> DreamerV2:

@@ -93,11 +93,15 @@ def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_i
     frequency, unit = model.train_freq
     steps = frequency if unit == TrainFrequencyUnit.STEP else None
     env: LearningVecEnv | None = None
+
+    def update() -> None:
+        _update(model, frequency * model.n_envs, ahead=model.n_envs)
+
     while model.num_timesteps < total_timesteps:
         assert model.env is not None
         if env is None or env.venv is not model.env:
             # At first, and when a callback brought other environments.
-            env = LearningVecEnv(model.env, lambda: _update(model, ahead=model.n_envs), model.overlap, model.forget_step)
+            env = LearningVecEnv(model.env, update, model.overlap, model.forget_step)
         rollout = model.collect_rollouts(
             env.begin(steps),
             callbacks,
@@ -114,18 +118,15 @@ def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_i
             _update(model, rollout.episode_timesteps)
 
 
-def _update(model: DreamerV2, collected: int | None = None, ahead: int = 0) -> None:
+def _update(model: DreamerV2, collected: int, ahead: int = 0) -> None:
     """The updates after, or within the last step of, one rollout.
 
-    :param collected: agent steps of the rollout; None: as many as ``train_freq`` says
+    :param collected: agent steps of the rollout
     :param ahead: agent steps that are under way, and not yet counted in ``num_timesteps``
     """
     # SB3 gates on num_timesteps, which every learn() resets.
     if model.phase_timesteps <= model.learning_starts:
         return
-    if collected is None:
-        assert isinstance(model.train_freq, TrainFreq)
-        collected = model.train_freq.frequency * model.n_envs
     model._update_current_progress_remaining(model.num_timesteps + ahead, model._total_timesteps)
     model.train(model.gradient_steps if model.gradient_steps >= 0 else collected, model.batch_size)
     model.policy.set_training_mode(False)

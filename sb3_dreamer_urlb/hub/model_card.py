@@ -16,14 +16,14 @@ import sb3_dreamer_urlb
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.snapshots.model_data import argument_names
+from sb3_dreamer_urlb.snapshots.model_data import argument, argument_names
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 FROM_SCRATCH = "none, learnt from scratch"
 #: say something about the machine, or have a line of their own
-NOT_LISTED = ("verbose", "tensorboard_log", "seed", "intrinsic_reward", "planner")
+NOT_LISTED = ("verbose", "tensorboard_log", "stats_window_size", "seed", "intrinsic_reward", "planner")
 
 
 @dataclass(frozen=True)
@@ -250,9 +250,9 @@ def changed_arguments(model: DreamerV2) -> dict[str, Any]:
     aliases = [alias for alias, known in model.policy_aliases.items() if known is kind]
     found: dict[str, Any] = {"policy": (aliases or [kind.__name__])[0]}
     for name in argument_names(type(model)):
-        if name in NOT_LISTED or name == "stats_window_size":
+        if name in NOT_LISTED:
             continue
-        value = getattr(model, name)
+        value = argument(model, name)
         if name == "train_freq":
             value = value.frequency if value.unit.value == "step" else (value.frequency, value.unit.value)
         # None, {} and what the preset filled in compare by what they are now.

@@ -68,7 +68,7 @@ class PreparedAgent(PlannedAgent):
         def head(mlp: MLP) -> _Head:
             return _Head(mlp, variables, classes, dtype)
 
-        self._dynamics = _Dynamics(model.rssm, dtype)
+        self._dynamics = _Dynamics(model.rssm, self._stoch_rows, dtype)
         self._reward, self._value = head(model.reward), head(agent.slow_critic)
         self._discount = None if model.discount_logit is None else head(model.discount_logit)
 
@@ -137,12 +137,13 @@ class _Dynamics:
     """The RSSM's prior step.
 
     :param rssm: the network
+    :param stoch_rows: its :meth:`~sb3_dreamer_urlb.world_model.rssm.RSSM.stoch_rows`
     :param dtype: of products
     """
 
-    def __init__(self, rssm: RSSM, dtype: th.dtype):
+    def __init__(self, rssm: RSSM, stoch_rows: th.Tensor, dtype: th.dtype):
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
-        self.rows = rssm.stoch_rows().to(dtype)
+        self.rows = stoch_rows.to(dtype)
         self.action = PrepackedLinear(rssm.input.weight[:, rssm.stoch_size :], rssm.input.bias, dtype)
         self.gru, self.norm = _in_order_of_use(rssm, dtype)
         self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)

@@ -5,15 +5,13 @@ Each episode goes there once, when it ends, and takes the memory of its rows; on
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch as th
 
-from sb3_dreamer_urlb.replay.episode import Episode, observation_of
+from sb3_dreamer_urlb.replay.episode import Episode, NamedRows
 
 
-class DeviceEpisode:
+class DeviceEpisode(NamedRows):
     """A finished episode on a device.
 
     :param columns: rows of each of ``SequenceReplayBuffer.columns``, (rows, …)
@@ -53,14 +51,3 @@ class DeviceEpisode:
     def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """The same on the host, copied unless it is the device."""
         return {name: part.cpu().numpy() for name, part in self.part(start, stop).items()}
-
-    def __getattr__(self, name: str) -> Any:
-        # A column by its name, whole, as of an episode in memory.
-        if name.startswith("_") or name == "columns":
-            raise AttributeError(name)
-        rows = self.rows(0, len(self))
-        if name == "observation":
-            return observation_of(rows)
-        if name not in rows:
-            raise AttributeError(name)
-        return rows[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,7 +13,29 @@ RawObservation = np.ndarray | dict[str, np.ndarray]
 OBSERVATION = "observation"
 
 
-class Episode:
+#: what rows hold
+COLUMNS = (OBSERVATION, "action", "reward", "is_terminal", "skill")
+
+
+class NamedRows(ABC):
+    """An episode, wherever it is kept, with a name for all rows of each column: ``episode.reward``, …, by name for Dicts."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Rows."""
+
+    @abstractmethod
+    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Some rows of every column, by name."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in COLUMNS:
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        rows = self.rows(0, len(self))
+        return observation_of(rows) if name == OBSERVATION else rows[name]
+
+
+class Episode(NamedRows):
     """Contiguous rows that grow while the episode is open.
 
     :param observation: the episode's first observation; a Dict observation takes one column for each part
@@ -47,36 +70,11 @@ class Episode:
     def __len__(self) -> int:
         return self.length
 
-    @property
-    def observation(self) -> RawObservation:
-        """All rows of it, by name for Dict observations."""
-        return observation_of(self.columns)
-
-    @property
-    def action(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["action"]
-
-    @property
-    def reward(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["reward"]
-
-    @property
-    def is_terminal(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["is_terminal"]
-
-    @property
-    def skill(self) -> np.ndarray:
-        """All rows of it."""
-        return self.columns["skill"]
-
     def append(
         self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
     ) -> None:
         """Add the row that ``action``, chosen under ``skill``, led to."""
-        if self.length == len(self.reward):
+        if self.length == len(self.columns["reward"]):
             self._resize(2 * self.length)
         seen = observation_columns(observation)
         self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})

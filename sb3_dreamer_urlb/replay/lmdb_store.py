@@ -21,6 +21,8 @@ from typing import IO, Any
 import lmdb
 import numpy as np
 
+from sb3_dreamer_urlb.replay.episode import NamedRows
+
 #: rows that are read and written together
 CHUNK = 25
 VERSION = 1
@@ -37,7 +39,7 @@ class ReplayStoreError(RuntimeError):
     """A replay store cannot be used; the message names its folder and why."""
 
 
-class StoredEpisode:
+class StoredEpisode(NamedRows):
     """An episode in the file; reads when asked.
 
     :param store: that holds it
@@ -54,12 +56,6 @@ class StoredEpisode:
     def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """Some rows of every column."""
         return self.store.read(self, start, stop)
-
-    def __getattr__(self, name: str) -> Any:
-        # A column by its name, whole.
-        if name.startswith("_") or name not in self.store.layout:
-            raise AttributeError(name)
-        return self.rows(0, self.length)[name]
 
 
 class LmdbStore:

@@ -27,11 +27,11 @@ def check_store(store: str, path: str | os.PathLike[str] | None, map_size: int |
     """
     if store not in STORES:
         raise ValueError(f"store must be one of {list(STORES)}, got {store!r}.")
-    if (store == "lmdb") != (path is not None):
+    if (store == LMDB) != (path is not None):
         raise ValueError(f"store={store!r} and path={path!r}: a path is for store='lmdb', which needs one.")
-    if map_size is not None and (store != "lmdb" or map_size < 1 << 20):
+    if map_size is not None and (store != LMDB or map_size < 1 << 20):
         raise ValueError(f"map_size must be at least {1 << 20} bytes, and is for store='lmdb' only, got {map_size!r}.")
-    if store == "lmdb":
+    if store == LMDB:
         try:
             import lmdb  # noqa: F401
         except ModuleNotFoundError as error:

@@ -30,7 +30,5 @@ def convert(old: str | os.PathLike[str], new: str | os.PathLike[str], trust: boo
         warnings.simplefilter("ignore")
         # DreamerV2's own load is the safe one.
         model: DreamerV2 = BaseAlgorithm.load.__func__(DreamerV2, path, device="cpu")  # type: ignore[attr-defined]
-    for optimizer in model.learner.optimizers().values():
-        optimizer.restore_settings()
     model.save(new)
     return model

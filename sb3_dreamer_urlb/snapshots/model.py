@@ -124,35 +124,28 @@ def _prepared(
 
     :raises CallersError: if the file alone would have been in order
     """
+
+    def prepare(custom: dict[str, Any], kwargs: dict[str, Any]) -> Model:
+        model = blank(algorithm, data, device, custom, kwargs)
+        restore_fields(model, data)
+        if env is not None:
+            check_for_correct_spaces(env, model.observation_space, model.action_space)
+            model.env, model.n_envs = env, env.num_envs
+            model._vec_normalize_env = unwrap_vec_normalize(env)
+        model._prepare()
+        return model
+
     try:
-        return _prepare(algorithm, data, env, device, custom, kwargs)
+        return prepare(custom, kwargs)
     except Exception as error:
         if not custom and not kwargs:
             raise
         given = {**custom, **kwargs}
         try:
-            _prepare(algorithm, data, env, device, {name: given[name] for name in needed(data) if name in given}, {})
+            prepare({name: given[name] for name in needed(data) if name in given}, {})
         except Exception:
             raise error from None
         raise CallersError(error) from None
-
-
-def _prepare(
-    algorithm: type[Model],
-    data: dict[str, Any],
-    env: VecEnv | None,
-    device: th.device,
-    custom: dict[str, Any],
-    kwargs: dict[str, Any],
-) -> Model:
-    model = blank(algorithm, data, device, custom, kwargs)
-    restore_fields(model, data)
-    if env is not None:
-        check_for_correct_spaces(env, model.observation_space, model.action_space)
-        model.env, model.n_envs = env, env.num_envs
-        model._vec_normalize_env = unwrap_vec_normalize(env)
-    model._prepare()
-    return model
 
 
 def _build_checked(model: DreamerV2, archive: Archive) -> None:

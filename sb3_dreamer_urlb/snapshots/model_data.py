@@ -84,9 +84,14 @@ def describe(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
 
 def describe_arguments(model: DreamerV2) -> dict[str, Any]:
     """The constructor arguments of a model, as JSON."""
-    arguments = {name: getattr(model, ATTRIBUTES.get(name, name)) for name in argument_names(type(model))}
+    arguments = {name: argument(model, name) for name in argument_names(type(model))}
     arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
     return {name: values.encode_or_describe(value) for name, value in arguments.items()}
+
+
+def argument(model: DreamerV2, name: str) -> Any:
+    """A constructor argument, as the model has it."""
+    return getattr(model, ATTRIBUTES.get(name, name))
 
 
 def argument_names(algorithm: type[DreamerV2]) -> list[str]:
