@@ -1,8 +1,6 @@
 // ELU in place behind a product without its bias, and its gradient together with that of the bias.
 
-#include "vectors.h"
-
-static inline Floats elu(Floats x) { return x > 0.0f ? x : exp(x) - 1.0f; }
+#include "activation.h"
 
 // x ← ELU(x + bias), x (rows, columns); no bias: null.
 template <class T>
@@ -26,8 +24,6 @@ static void bias_elu(T* x, const T* bias, Index rows, Index columns, int threads
     }
 }
 
-static inline Floats slope(Floats y) { return (y > 0.0f ? all(0) : y) + 1.0f; }
-
 // out ← gradient · ELU'(where the output is y); sums (threads, period) of out by place in the period, null for none.
 template <class T>
 static void elu_backward(const T* grad, const T* y, T* out, float* sums, Index size, Index period, int threads) {
@@ -41,12 +37,12 @@ static void elu_backward(const T* grad, const T* y, T* out, float* sums, Index s
             const Index first = r * period, length = size - first < period ? size - first : period;
             Index i = 0;
             for (; i + LANES <= length; i += LANES) {
-                Floats g = load(grad + first + i) * slope(load(y + first + i));
+                Floats g = load(grad + first + i) * elu_slope(load(y + first + i));
                 store(out + first + i, g);
                 if (mine) store(mine + i, load(mine + i) + g);
             }
             if (i < length) {
-                Floats g = load(grad + first + i, length - i) * slope(load(y + first + i, length - i));
+                Floats g = load(grad + first + i, length - i) * elu_slope(load(y + first + i, length - i));
                 store(out + first + i, g, length - i);
                 if (mine) store(mine + i, load(mine + i, length - i) + g, length - i);
             }

@@ -1,165 +1,193 @@
-// The gradient of weights: leftᵀ · right, where both have many more rows than columns, on a processor's tiles (AMX).
-//
-// A tile holds 16 rows of 32 numbers. One instruction multiplies a tile of the left operand with one of the right, whose
-// numbers must lie in pairs of rows, and adds the result to a tile of 16×16 sums in float32. Both operands are laid out that
-// way a block of rows at a time, and each block's product is added to all sums.
+// Products of a layer with many rows, on tiles (tiles.h): rows · weights with what follows them, and the gradient of weights.
 
-#include "vectors.h"
+#include <cstdlib>
 
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include <vector>
+#include "activation.h"
+#include "tiles.h"
 
-constexpr Index TILE = 16, DEPTH = 32, BLOCK = 512;  // numbers a side of a tile of sums, rows that a tile multiplies, rows laid out
-
-static inline Index up_to(Index x, Index multiple) { return (x + multiple - 1) / multiple * multiple; }
-
-#if defined(__AMX_TILE__) && defined(__AMX_BF16__)
-
-using Laid = std::vector<uint16_t>;
-
-// Rows 2j and 2j + 1 of 16 columns as one row of pairs.
-static inline __m512i pair(const BF16* first, const BF16* second, __mmask16 columns) {
-    __m512i low = _mm512_cvtepu16_epi32(first ? _mm256_maskz_loadu_epi16(columns, first) : _mm256_setzero_si256());
-    __m512i high = _mm512_cvtepu16_epi32(second ? _mm256_maskz_loadu_epi16(columns, second) : _mm256_setzero_si256());
-    return _mm512_or_si512(low, _mm512_slli_epi32(high, 16));
-}
-
-// 16×16 numbers of 32 bits.
-static inline void transpose(__m512i x[16]) {
-    __m512i y[16];
-    for (int i = 0; i < 16; i += 2) {
-        y[i] = _mm512_unpacklo_epi32(x[i], x[i + 1]);
-        y[i + 1] = _mm512_unpackhi_epi32(x[i], x[i + 1]);
-    }
-    for (int i = 0; i < 16; i += 4) {
-        for (int j = 0; j < 2; j++) {
-            x[i + 2 * j] = _mm512_unpacklo_epi64(y[i + j], y[i + j + 2]);
-            x[i + 2 * j + 1] = _mm512_unpackhi_epi64(y[i + j], y[i + j + 2]);
-        }
-    }
-    for (int i = 0; i < 4; i++) {
-        for (int half = 0; half < 2; half++) {
-            y[i + 8 * half] = _mm512_shuffle_i32x4(x[i + 8 * half], x[i + 8 * half + 4], 0x88);
-            y[i + 8 * half + 4] = _mm512_shuffle_i32x4(x[i + 8 * half], x[i + 8 * half + 4], 0xdd);
-        }
-    }
-    for (int i = 0; i < 8; i++) {
-        x[i] = _mm512_shuffle_i32x4(y[i], y[i + 8], 0x88);
-        x[i + 8] = _mm512_shuffle_i32x4(y[i], y[i + 8], 0xdd);
-    }
-}
-
-// rows × columns of x → tiles, those of 32 rows and the same 16 columns next to those of the next 32 rows.
-static void lay_out(const BF16* x, Index stride, Index rows, Index columns, bool transposed, uint16_t* out) {
-    const Index steps = up_to(rows, DEPTH) / DEPTH;
-    for (Index c = 0; c < up_to(columns, 2 * TILE); c += TILE) {
-        const Index left = columns - c;
-        const __mmask16 mask = left >= TILE ? 0xffff : left > 0 ? (1 << left) - 1 : 0;
-        for (Index s = 0; s < steps; s++, out += TILE * DEPTH) {
-            __m512i tile[TILE];
-            for (Index j = 0; j < TILE; j++) {
-                const Index r = s * DEPTH + 2 * j;
-                const BF16* row = x + r * stride + c;
-                tile[j] = pair(r < rows ? row : nullptr, r + 1 < rows ? row + stride : nullptr, mask);
-            }
-            if (transposed) transpose(tile);
-            for (Index j = 0; j < TILE; j++) _mm512_storeu_si512(out + j * DEPTH, tile[j]);
-        }
-    }
-}
-
-struct alignas(64) TileShapes {
-    uint8_t palette = 1, start_row = 0, reserved[14] = {};
-    uint16_t row_bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
-    uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
-};
-
-// Tiles belong to everybody in a thread: whoever used them before finds them as they were.
-class Tiles {
-    alignas(64) uint8_t before[64];
-
-  public:
-    Tiles() {
-        static const TileShapes shapes;
-        _tile_storeconfig(before);
-        _tile_loadconfig(&shapes);
-    }
-    ~Tiles() { _tile_loadconfig(before); }
-};
-
-// sums (M, N) += leftᵀ · right for laid out operands of some rows; M and N are multiples of 32.
-static void add_product(const uint16_t* left, const uint16_t* right, float* sums, Index m, Index n, Index rows) {
-    const Index steps = up_to(rows, DEPTH) / DEPTH, column = steps * TILE * DEPTH, bytes = n * sizeof(float);
-    for (Index i = 0; i < m / TILE; i += 2) {
-        for (Index j = 0; j < n / TILE; j += 2) {
-            float* c = sums + (i * n + j) * TILE;
-            _tile_loadd(0, c, bytes);
-            _tile_loadd(1, c + TILE, bytes);
-            _tile_loadd(2, c + TILE * n, bytes);
-            _tile_loadd(3, c + TILE * n + TILE, bytes);
-            const uint16_t *a = left + i * column, *b = right + j * column;
-            for (Index s = 0; s < steps; s++, a += TILE * DEPTH, b += TILE * DEPTH) {
-                _tile_loadd(4, a, 64);
-                _tile_loadd(6, b, 64);
-                _tile_dpbf16ps(0, 4, 6);
-                _tile_loadd(7, b + column, 64);
-                _tile_dpbf16ps(1, 4, 7);
-                _tile_loadd(5, a + column, 64);
-                _tile_dpbf16ps(2, 5, 6);
-                _tile_dpbf16ps(3, 5, 7);
-            }
-            _tile_stored(0, c, bytes);
-            _tile_stored(1, c + TILE, bytes);
-            _tile_stored(2, c + TILE * n, bytes);
-            _tile_stored(3, c + TILE * n + TILE, bytes);
-        }
-    }
-}
+#ifdef HAS_TILES
 
 EXPORT int has_tiles() {
     const long REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     return syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0;
 }
 
-// out (m, n) ← leftᵀ · right; left (rows, m), right (rows, n), their rows `stride` numbers apart. sums: (threads, M, N) of
-// zeros, M and N the next multiples of 32.
-EXPORT void transposed_product(const BF16* left, Index left_stride, const BF16* right, Index right_stride, float* sums, float* out,
-                               Index rows, Index m, Index n, int threads) {
-    const Index wide_m = up_to(m, 2 * TILE), wide_n = up_to(n, 2 * TILE);
-#pragma omp parallel num_threads(threads)
+// -- rows · weights ---------------------------------------------------------------------------------------------------
+
+// Weights (outputs, depth), or (depth, outputs) if by_depth, as the right operand.
+template <class T>
+static void lay_out_weights(const T* weight, Index stride, Index outputs, Index depth, bool by_depth, uint16_t* out) {
+    if (by_depth)
+        lay_out_by_depth<RIGHT>(weight, stride, outputs, depth, out);
+    else
+        lay_out_right(weight, stride, outputs, depth, out);
+}
+
+// What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
+template <class Out>
+struct Behind {
+    const float* bias;
+    const Out* plus;
+    Index plus_stride;
+    bool elu;
+    Out* out;
+    Index out_stride;
+
+    // sums: four tiles, of 32 rows and 32 columns of the result; the rows from begin to end and the first columns.
+    void operator()(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
+        if (columns < PANEL)
+            write<true>(sums, r, c, begin, end, columns);
+        else
+            write<false>(sums, r, c, begin, end, columns);
+    }
+
+    template <bool some>
+    void write(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
+        const Out *its_plus = plus ? plus + r * plus_stride + c : nullptr;
+        Out* its_out = out + (r + begin) * out_stride + c;
+        const bool its_elu = elu;
+        const __mmask32 mask = first(columns);
+        const Two b = !bias ? Two{} : load_two<some>(bias + c, mask);
+        for (Index i = begin; i < end; i++, its_out += out_stride) {
+            const float* sum = sums + (i / TILE * 2 * TILE + i % TILE) * TILE;
+            Two y = {load(sum) + b.low, load(sum + TILE * TILE) + b.high};
+            if (its_plus) {
+                Two p = load_two<some>(its_plus + i * plus_stride, mask);
+                y = {y.low + p.low, y.high + p.high};
+            }
+            if (its_elu) y = {::elu(y.low), ::elu(y.high)};
+            store_two<some>(its_out, y, mask);
+        }
+    }
+};
+
+// Whole rows that begin with a line of the cache can be read as they are. What stands behind them, up to a step, meets weights
+// of 0; it belongs to the same memory, because the next row begins with a line, too.
+static inline bool fits(const BF16* x, Index stride, Index rows) {
+    return rows >= PANEL && stride % DEPTH == 0 && (uintptr_t)x % 64 == 0;
+}
+static inline bool fits(const float*, Index, Index) { return false; }
+
+static inline Left as_it_is(const BF16* x, Index stride) { return Left(x, stride); }
+static inline Left as_it_is(const float* x, Index) { return Left((const uint16_t*)x, 3); }  // never
+
+template <class T, class Out>
+static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights, Index outputs,
+                            Behind<Out> behind, int threads) {
+    const Index steps = steps_of(depth), panel = steps * 2 * PARTS<T> * NUMBERS, blocks = (rows + PANEL - 1) / PANEL;
+#pragma omp parallel num_threads(least(threads, blocks))
     {
-        const Index me = omp_get_thread_num(), us = omp_get_num_threads();
-        const Index share = up_to((rows + us - 1) / us, DEPTH), begin = share * me, end = begin + share < rows ? begin + share : rows;
-        float* mine = sums + me * wide_m * wide_n;
-        if (begin < end) {
-            const Index blocks = (end - begin + BLOCK - 1) / BLOCK, size = up_to((end - begin + blocks - 1) / blocks, DEPTH);
-            static thread_local Laid laid_left, laid_right;
-            laid_left.resize(wide_m * size), laid_right.resize(wide_n * size);
-            Tiles tiles;
-            for (Index r = begin; r < end; r += size) {
-                const Index count = end - r < size ? end - r : size;
-                lay_out(left + r * left_stride, left_stride, count, m, true, laid_left.data());
-                lay_out(right + r * right_stride, right_stride, count, n, false, laid_right.data());
-                add_product(laid_left.data(), laid_right.data(), mine, wide_m, wide_n, count);
+        static thread_local Scratch scratch;
+        uint16_t* laid = (uint16_t*)scratch.get(panel * sizeof(uint16_t));
+        alignas(64) float sums[2][4 * TILE * TILE];
+        Tiles tiles;
+#pragma omp for schedule(static)
+        for (Index block = 0; block < blocks; block++) {
+            const Index r = block * PANEL, height = least(rows - r, PANEL);
+            const bool as_is = fits(x, stride, height);
+            if (!as_is) lay_out_left(x + r * stride, stride, height, depth, laid);
+            const Left left = as_is ? as_it_is(x + r * stride, stride) : Left(laid, PARTS<T>);
+            const Index panels = (outputs + PANEL - 1) / PANEL, share = (height + steps - 1) / steps;
+            for (Index p = 0; p < panels; p++) {
+                const float* before = sums[(p + 1) % 2];
+                zero_sums();
+                add_steps<PARTS<T>>(left, weights + p * panel, steps, p % 2, [&](Index i) {
+                    if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
+                });
+                store_sums(sums[p % 2]);
+            }
+            behind(sums[(panels - 1) % 2], r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
+        }
+    }
+}
+
+// -- the gradient of weights ------------------------------------------------------------------------------------------
+
+constexpr Index ROWS = 320, COLUMNS = 512;  // laid out at a time: together with their sums, what a core's cache holds
+
+template <class T>
+static void add_transposed_product(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, Index rows,
+                                   Index m, Index n) {
+    static thread_local Scratch scratch;
+    const Index size = least(up_to(rows, DEPTH), ROWS), wide = least(n, COLUMNS);
+    uint16_t* laid_left = (uint16_t*)scratch.get((laid_size<T>(m, size) + laid_size<T>(wide, size)) * sizeof(uint16_t));
+    uint16_t* laid_right = laid_left + laid_size<T>(m, size);
+    Tiles tiles;
+    for (Index c = 0; c < n; c += COLUMNS) {
+        const Index columns = least(n - c, COLUMNS);
+        for (Index r = 0; r < rows; r += size) {
+            const Index count = least(rows - r, size), panel = steps_of(count) * 2 * PARTS<T> * NUMBERS;
+            lay_out_by_depth<LEFT>(left + r * left_stride, left_stride, m, count, laid_left);
+            lay_out_by_depth<RIGHT>(right + r * right_stride + c, right_stride, columns, count, laid_right);
+            float* sum = sums + up_to(m, PANEL) * c;
+            for (Index i = 0; i < m; i += PANEL) {
+                for (Index j = 0; j < columns; j += PANEL, sum += PANEL * PANEL) {
+                    for (Index k = 0; k < PANEL * PANEL; k += TILE) __builtin_prefetch(sum + PANEL * PANEL + k, 1);
+                    load_sums(sum);
+                    add_steps<PARTS<T>>(Left(laid_left + i / PANEL * panel, PARTS<T>), laid_right + j / PANEL * panel, steps_of(count),
+                                        j / PANEL % 2, [](Index) {});
+                    store_sums(sum);
+                }
             }
         }
+    }
+}
+
+// sums (threads, up_to(m, 32) · up_to(n, 32)): zeros.
+template <class T>
+static void transposed_product(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, float* out,
+                               Index rows, Index m, Index n, int threads) {
+    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
+#pragma omp parallel num_threads(threads)
+    {
+        const Index me = omp_get_thread_num(), us = omp_get_num_threads(), share = up_to((rows + us - 1) / us, DEPTH);
+        const Index begin = share * me, count = least(rows - begin, share);
+        if (count > 0)
+            add_transposed_product(left + begin * left_stride, left_stride, right + begin * right_stride, right_stride,
+                                   sums + me * size, count, m, n);
 #pragma omp barrier
 #pragma omp for schedule(static)
         for (Index i = 0; i < m; i++) {
             for (Index j = 0; j < n; j++) {
+                const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
+                const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
+                const Index at = block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE + j % TILE;
                 float total = 0;
-                for (Index t = 0; t < us; t++) total += sums[(t * wide_m + i) * wide_n + j];
+                for (Index t = 0; t < us; t++) total += sums[t * size + at];
                 out[i * n + j] = total;
             }
         }
     }
 }
 
+#define FOR(T, NAME)                                                                                                   \
+    EXPORT Index laid_size_##NAME(Index across, Index depth) { return laid_size<T>(across, depth); }                   \
+    EXPORT void lay_out_weights_##NAME(const T* weight, Index stride, Index outputs, Index depth, int by_depth, uint16_t* out) { \
+        lay_out_weights(weight, stride, outputs, depth, by_depth, out);                                                \
+    }                                                                                                                  \
+    EXPORT void transposed_product_##NAME(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, \
+                                          float* out, Index rows, Index m, Index n, int threads) {                     \
+        transposed_product(left, left_stride, right, right_stride, sums, out, rows, m, n, threads);                    \
+    }
+FOR(float, float)
+FOR(BF16, bfloat16)
+
+#define PRODUCT(T, OUT, NAME)                                                                                          \
+    EXPORT void rows_by_weights_##NAME(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights,      \
+                                       Index outputs, const float* bias, const OUT* plus, Index plus_stride, int elu,  \
+                                       OUT* out, Index out_stride, int threads) {                                      \
+        Behind<OUT> behind{bias, plus, plus_stride, (bool)elu, out, out_stride};                                       \
+        rows_by_weights(x, stride, rows, depth, weights, outputs, behind, threads);                                    \
+    }
+PRODUCT(float, float, float)
+PRODUCT(BF16, BF16, bfloat16)
+PRODUCT(BF16, float, bfloat16_to_float)
+
 #else
 
 EXPORT int has_tiles() { return 0; }
-EXPORT void transposed_product(const BF16*, Index, const BF16*, Index, float*, float*, Index, Index, Index, int) {}
 
 #endif

@@ -77,19 +77,27 @@ static inline float sum(Floats x) {
     return total;
 }
 
-// exp(x) with a relative error of 2e-7. Below -87 and above 88 it stays what it is there.
+// exp(x) = 2^k · 2^f with k whole and |f| at most 1/2; the polynomial is the minimax one, off by 9e-8 of its value. Below -87
+// what it is there; infinity gives NaN, as NaN does.
 static inline Floats exp(Floats x) {
-    x = x < -87.0f ? all(-87.0f) : x;
-    x = x > 88.0f ? all(88.0f) : x;
+    const float LOG2_E = 1.44269504f;
+#ifdef __AVX512F__
+    x = (Floats)_mm512_max_ps(_mm512_set1_ps(-87.0f), (__m512)x);  // in this order NaN stays
+    Floats k = (Floats)_mm512_roundscale_ps((__m512)(x * LOG2_E), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+#else
     const float MAGIC = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer, which then stands in the lowest bits
-    Floats shifted = x * 1.44269504f + MAGIC;
-    Floats k = shifted - MAGIC;
-    Floats r = x - k * 0.693359375f + k * 2.12194440e-4f;
-    Floats p = r * 1.9875691e-4f + 1.3981999e-3f;
-    p = p * r + 8.3334519e-3f;
-    p = p * r + 4.1665796e-2f;
-    p = p * r + 1.6666665e-1f;
-    p = p * r + 0.5f;
-    p = p * r * r + r + 1.0f;
+    x = x < -87.0f ? all(-87.0f) : x;
+    Floats shifted = x * LOG2_E + MAGIC, k = shifted - MAGIC;
+#endif
+    Floats f = x * LOG2_E - k;
+    Floats p = f * 1.32647180e-3f + 9.67151299e-3f;
+    p = p * f + 5.55073395e-2f;
+    p = p * f + 2.40222424e-1f;
+    p = p * f + 6.93147004e-1f;
+    p = p * f + 1.0f;
+#ifdef __AVX512F__
+    return (Floats)_mm512_scalef_ps((__m512)p, (__m512)k);
+#else
     return (Floats)((Ints)p + ((Ints)shifted << 23));
+#endif
 }
