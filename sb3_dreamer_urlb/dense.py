@@ -1,7 +1,9 @@
-"""Products with weights while learning on a CPU in bfloat16, where oneDNN is slow at the gradient of wide weights.
+"""Dense layers with many rows on a CPU, forward and backward: with kernels of our own where there are some (native/).
 
-That gradient is a product whose left operand lies in memory the wrong way round. Laid out first, the narrower one of the two
-operands, it takes two thirds of the time (docs/performance.md). Elsewhere these are torch's own products.
+They lay the weights out once a product, add the bias and apply ELU before a sum ever leaves the processor, and give the
+gradients of weights in float32. Elsewhere these are torch's own products, but for the gradient of wide weights in bfloat16:
+oneDNN is slow where the left operand lies in memory the wrong way round. Laid out first, the narrower one of the two operands,
+it takes two thirds of the time (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -9,20 +11,26 @@ from __future__ import annotations
 import torch as th
 import torch.nn.functional as F
 from torch.autograd import Function
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import FunctionCtx, once_differentiable
 
-#: rows and inputs from which on it pays
+from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.activation import elu_
+from sb3_dreamer_urlb.native import ops, product_ops
+
+#: rows and inputs from which on laying an operand out pays
 ROWS, INPUTS = 1024, 1024
 
 
-def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None) -> th.Tensor:
     """x · weightᵀ + bias.
 
     :param x: (…, inputs)
     :param weight: (outputs, inputs)
-    :param bias: (outputs,)
+    :param bias: (outputs,), None for none
     """
-    if not _cheaper(x, weight):
+    if _on_tiles(x, weight):
+        return _layer(x, weight, bias, False)
+    if bias is None or not _cheaper(x, weight):
         return F.linear(x, weight, bias)
     dtype = th.get_autocast_dtype("cpu")
     # Outside of the function, so that autograd brings the gradients back to float32.
@@ -32,20 +40,75 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
     return y.view(*x.shape[:-1], -1)
 
 
+def linear_elu(x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    """ELU(x · weightᵀ + bias); parameters as those of :func:`linear`."""
+    return _layer(x, weight, bias, True) if _on_tiles(x, weight) else elu_(linear(x, weight, bias))
+
+
 def column_sums(x: th.Tensor) -> th.Tensor:
     """(n, m) → (m,). As a product with ones, which takes half the time of torch's sum in bfloat16."""
     return x.sum(0) if x.dtype != th.bfloat16 or x.shape[1] < 16 else (x.new_ones(1, len(x)) @ x).squeeze(0)
 
 
+def _dtype(x: th.Tensor) -> th.dtype:
+    """The format of a product with x."""
+    return th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
+
+
+def _on_tiles(x: th.Tensor, weight: th.Tensor) -> bool:
+    if not native.active() or x.device.type != "cpu" or _dtype(x) not in ops.FORMATS:
+        return False
+    return product_ops.worthwhile(x.shape[:-1].numel(), x.shape[-1], len(weight))
+
+
+def _layer(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, elu: bool) -> th.Tensor:
+    # Outside of the function, so that autograd brings x's gradient back.
+    rows = x.to(_dtype(x)).flatten(0, -2)
+    y: th.Tensor = _Layer.apply(rows, weight, bias, elu)  # type: ignore[no-untyped-call]
+    return y.view(*x.shape[:-1], -1)
+
+
+class _Layer(Function):
+    """Rows (n, inputs) in the format of products; float32 weights, whatever the format."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, elu: bool) -> th.Tensor:
+        x, weight = (part if part.stride(-1) == 1 else part.contiguous() for part in (x, weight))
+        weight = weight.to(x.dtype)
+        y: th.Tensor = product_ops.rows_by_weights(x, product_ops.lay_out_weights(weight, False), len(weight), bias, None, elu)
+        wants_weight = ctx.needs_input_grad[1]  # type: ignore[attr-defined]
+        ctx.save_for_backward(x if wants_weight else None, weight, y if elu else None)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, th.Tensor | None, th.Tensor | None, None]:
+        x, weight, y = ctx.saved_tensors  # type: ignore[attr-defined]
+        wants_x, wants_weight, wants_bias, _ = ctx.needs_input_grad  # type: ignore[attr-defined]
+        x_grad = weight_grad = bias_grad = None
+        if y is not None:
+            grad, bias_grad = ops.elu_backward(grad, y, wants_bias)
+        else:
+            grad = grad.contiguous()
+            bias_grad = column_sums(grad).float() if wants_bias else None
+        if wants_x:
+            x_grad = product_ops.rows_by_weights(
+                grad, product_ops.lay_out_weights(weight, True), weight.shape[1], None, None, False
+            )
+        if wants_weight:
+            weight_grad = product_ops.transposed_product(grad, x)
+        return x_grad, weight_grad, bias_grad if wants_bias else None, None
+
+
 class _Linear(Function):
     @staticmethod
-    def forward(ctx: th.autograd.function.FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+    def forward(ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(x, weight)
         return F.linear(x, weight, bias)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, th.Tensor, th.Tensor]:
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, th.Tensor, th.Tensor]:
         x, weight = ctx.saved_tensors  # type: ignore[attr-defined]
         x_grad = grad @ weight if ctx.needs_input_grad[0] else None  # type: ignore[attr-defined]
         if grad.shape[1] < x.shape[1]:

@@ -9,8 +9,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.dense import linear
+from sb3_dreamer_urlb.dense import linear_elu
 from sb3_dreamer_urlb.precision import full
 
 
@@ -33,7 +32,7 @@ class MLP(nn.Module):
         """The last hidden layer, (…, inputs) → (…, net_arch[-1])."""
         for layer in self.dense:
             assert isinstance(layer, nn.Linear)
-            x = elu_(linear(x, layer.weight, layer.bias))
+            x = linear_elu(x, layer.weight, layer.bias)
         return x
 
     def forward(self, x: th.Tensor) -> th.Tensor:

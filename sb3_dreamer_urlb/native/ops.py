@@ -25,6 +25,8 @@ ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "bias_elu_": (_POINTER, _POINTER, _INDEX, _INDEX, _INT),
     "elu_backward_": (_POINTER, _POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
 }
+#: the same of functions that only some processors have, by the name of the function that says so
+OPTIONAL: dict[str, dict[str, tuple[Any, ...]]] = {}
 #: sums of columns that a thread keeps at a time, at most, unless a row has more; they stay in the processor's cache
 PERIOD = 1024
 
@@ -37,7 +39,11 @@ def bind(library: ctypes.CDLL) -> None:
     :raises NativeUnavailable: where one is missing
     """
     found: dict[str, Callable[..., None]] = {}
-    for name, arguments in ARGUMENTS.items():
+    wanted = dict(ARGUMENTS)
+    for question, functions in OPTIONAL.items():
+        if getattr(library, question)():
+            wanted.update(functions)
+    for name, arguments in wanted.items():
         for full_name in [name + suffix for suffix in FORMATS.values()] if name.endswith("_") else [name]:
             try:
                 function = getattr(library, full_name)

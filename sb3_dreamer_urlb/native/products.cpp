@@ -19,11 +19,16 @@ EXPORT int has_tiles() {
 
 // Weights (outputs, depth), or (depth, outputs) if by_depth, as the right operand.
 template <class T>
-static void lay_out_weights(const T* weight, Index stride, Index outputs, Index depth, bool by_depth, uint16_t* out) {
-    if (by_depth)
-        lay_out_by_depth<RIGHT>(weight, stride, outputs, depth, out);
-    else
-        lay_out_right(weight, stride, outputs, depth, out);
+static void lay_out_weights(const T* weight, Index stride, Index outputs, Index depth, bool by_depth, uint16_t* out, int threads) {
+    const Index panels = (outputs + PANEL - 1) / PANEL, panel = laid_size<T>(PANEL, depth);
+#pragma omp parallel for num_threads(threads) if (outputs * depth > WORTH_A_THREAD)
+    for (Index p = 0; p < panels; p++) {
+        const Index some = least(outputs - p * PANEL, PANEL);
+        if (by_depth)
+            lay_out_by_depth<RIGHT>(weight + p * PANEL, stride, some, depth, out + p * panel);
+        else
+            lay_out_right(weight + p * PANEL * stride, stride, some, depth, out + p * panel);
+    }
 }
 
 // What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
@@ -126,7 +131,10 @@ static void add_transposed_product(const T* left, Index left_stride, const T* ri
             for (Index i = 0; i < m; i += PANEL) {
                 for (Index j = 0; j < columns; j += PANEL, sum += PANEL * PANEL) {
                     for (Index k = 0; k < PANEL * PANEL; k += TILE) __builtin_prefetch(sum + PANEL * PANEL + k, 1);
-                    load_sums(sum);
+                    if (r > 0)
+                        load_sums(sum);
+                    else
+                        zero_sums();
                     add_steps<PARTS<T>>(Left(laid_left + i / PANEL * panel, PARTS<T>), laid_right + j / PANEL * panel, steps_of(count),
                                         j / PANEL % 2, [](Index) {});
                     store_sums(sum);
@@ -136,15 +144,15 @@ static void add_transposed_product(const T* left, Index left_stride, const T* ri
     }
 }
 
-// sums (threads, up_to(m, 32) · up_to(n, 32)): zeros.
+// sums: room for threads · up_to(m, 32) · up_to(n, 32).
 template <class T>
 static void transposed_product(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, float* out,
                                Index rows, Index m, Index n, int threads) {
     const Index size = up_to(m, PANEL) * up_to(n, PANEL);
 #pragma omp parallel num_threads(threads)
     {
-        const Index me = omp_get_thread_num(), us = omp_get_num_threads(), share = up_to((rows + us - 1) / us, DEPTH);
-        const Index begin = share * me, count = least(rows - begin, share);
+        const Index share = up_to((rows + omp_get_num_threads() - 1) / omp_get_num_threads(), DEPTH);
+        const Index me = omp_get_thread_num(), us = (rows + share - 1) / share, begin = share * me, count = least(rows - begin, share);
         if (count > 0)
             add_transposed_product(left + begin * left_stride, left_stride, right + begin * right_stride, right_stride,
                                    sums + me * size, count, m, n);
@@ -165,8 +173,9 @@ static void transposed_product(const T* left, Index left_stride, const T* right,
 
 #define FOR(T, NAME)                                                                                                   \
     EXPORT Index laid_size_##NAME(Index across, Index depth) { return laid_size<T>(across, depth); }                   \
-    EXPORT void lay_out_weights_##NAME(const T* weight, Index stride, Index outputs, Index depth, int by_depth, uint16_t* out) { \
-        lay_out_weights(weight, stride, outputs, depth, by_depth, out);                                                \
+    EXPORT void lay_out_weights_##NAME(const T* weight, Index stride, Index outputs, Index depth, int by_depth, uint16_t* out, \
+                                       int threads) {                                                                  \
+        lay_out_weights(weight, stride, outputs, depth, by_depth, out, threads);                                       \
     }                                                                                                                  \
     EXPORT void transposed_product_##NAME(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, \
                                           float* out, Index rows, Index m, Index n, int threads) {                     \

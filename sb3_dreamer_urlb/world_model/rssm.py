@@ -8,6 +8,7 @@ from torch import nn
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.activation import elu_
+from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
 
@@ -133,20 +134,22 @@ class RSSM(nn.Module):
         return F.linear(action, self.input.weight[:, self.stoch_size :], self.input.bias)
 
     def _embed_part(self, embed: th.Tensor) -> th.Tensor:
-        return F.linear(embed, self.post_hidden.weight[:, self.deter_size :], self.post_hidden.bias)
+        return linear(embed, self.post_hidden.weight[:, self.deter_size :], self.post_hidden.bias)
 
     def _recur(self, state: LatentState, action_part: th.Tensor, stoch_part: th.Tensor | None = None) -> th.Tensor:
         if stoch_part is None:
-            stoch_part = F.linear(state.stoch, self.input.weight[:, : self.stoch_size])
+            stoch_part = linear(state.stoch, self.input.weight[:, : self.stoch_size], None)
         x = elu_(stoch_part + action_part)
-        parts = self.gru_norm(full(self.gru(th.cat([x, state.deter], -1))))
+        gates = linear(th.cat([x, state.deter], -1), self.gru.weight, self.gru.bias)
+        parts = self.gru_norm(full(gates))
         reset, candidate, update = parts.chunk(3, -1)
         candidate = th.tanh(th.sigmoid(reset) * candidate)
         # The bias of −1 makes a fresh GRU forget slowly (DreamerV2).
         return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
 
     def _prior(self, deter: th.Tensor) -> th.Tensor:
-        logits = self.prior_logits(elu_(self.prior_hidden(deter)))
+        hidden = linear_elu(deter, self.prior_hidden.weight, self.prior_hidden.bias)
+        logits = linear(hidden, self.prior_logits.weight, self.prior_logits.bias)
         return full(logits).view(deter.shape[:-1] + self.logits_shape)
 
     def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
