@@ -41,7 +41,7 @@ def bind(library: ctypes.CDLL) -> None:
     found: dict[str, Callable[..., None]] = {}
     wanted = dict(ARGUMENTS)
     for question, functions in OPTIONAL.items():
-        if getattr(library, question)():
+        if getattr(library, question, bool)():
             wanted.update(functions)
     for name, arguments in wanted.items():
         for full_name in [name + suffix for suffix in FORMATS.values()] if name.endswith("_") else [name]:
