@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, graphs, numerical_faults, phases, run_checkpoints, training_loop
+from sb3_dreamer_urlb import arguments, graphs, native, numerical_faults, phases, run_checkpoints, training_loop
 from sb3_dreamer_urlb.acting import ActingAlgorithm
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
@@ -94,9 +94,11 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         faster on this machine at this size; losses, statistics and weights are float32 in any case
     :param overlap: let environments in other processes step while an update runs; the result is the same, bit for bit. False
         lets them take turns
-    :param compile: how updates and actions run: ``"eager"``, operation by operation; ``"cuda_graphs"``, recorded once and
-        launched as a whole; ``"auto"``: CUDA graphs on CUDA, eager elsewhere. What cannot be recorded runs eager, after a
-        warning that says why
+    :param compile: how updates and actions run: ``"eager"``, operation by operation with torch's kernels; ``"native"``, on
+        CPUs, with kernels of our own where they are faster, which a C++ compiler on this machine builds in a second, once;
+        ``"cuda_graphs"``, recorded once and launched as a whole; ``"auto"``: CUDA graphs on CUDA, native on CPUs where that
+        can be had. What cannot be recorded or built runs eager, after a warning that says why; a compiler that is missing is
+        worth a warning with ``"native"`` only
     :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
@@ -268,6 +270,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.learner.updates = self.phase_updates
         if self.verbose >= 1:
             print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
+            print(f"Kernels: {native.describe(self.compile, self.device)}")
             print(f"Replay in the store {self.replay_buffer.store!r}")
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()

@@ -24,7 +24,7 @@ import torch as th
 from torch import nn
 
 #: values of ``compile``
-COMPILE = ("auto", "eager", "cuda_graphs")
+COMPILE = ("auto", "eager", "native", "cuda_graphs")
 #: calls of a situation before it is recorded
 WARM_UPS = 3
 #: new situations after which a function no longer counts as one that does the same again and again
@@ -66,7 +66,7 @@ def make_backend(compile: str, device: th.device | str) -> Backend | None:
     :return: None where everything runs as it is
     """
     device = th.device(device)
-    return None if compile == "eager" or device.type != "cuda" else CudaGraphs(device)
+    return CudaGraphs(device) if compile in ("auto", "cuda_graphs") and device.type == "cuda" else None
 
 
 def warn_if_in_vain(compile: str, device: th.device | str) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb import precision
+from sb3_dreamer_urlb import native, precision
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
@@ -114,7 +114,8 @@ class Learner:
         :param batch: (B, T, …) on the agent's device
         :return: metrics, detached scalars on the device
         """
-        metrics = self.recorder(batch, situation=self._situation())
+        with native.using(self.config.compile, self.device):
+            metrics = self.recorder(batch, situation=self._situation())
         self.guard.count()
         if self.agent.trains_behavior() and self.updates % self.config.target_update_interval == 0:
             self.agent.slow_critic.load_state_dict(self.agent.critic.state_dict())

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb import precision as precisions
 from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent
@@ -222,10 +223,11 @@ class DreamerPolicy(BasePolicy):
         :param is_first: bool (n,), true where an episode begins
         :param generator: source of randomness
         """
-        if generator is not None and self.agent.skills is not None:
-            # The seed of the skill to draw is computed on the host.
-            return self._observe((observation, state, is_first), generator)
-        return self._recorded()[0]((observation, state, is_first), generator, (self._skill_is_fixed(),))
+        with native.using(self.compile_mode, self.device):
+            if generator is not None and self.agent.skills is not None:
+                # The seed of the skill to draw is computed on the host.
+                return self._observe((observation, state, is_first), generator)
+            return self._recorded()[0]((observation, state, is_first), generator, (self._skill_is_fixed(),))
 
     @th.no_grad()
     def _observe(
@@ -266,7 +268,8 @@ class DreamerPolicy(BasePolicy):
             action = self.actions.random(len(state.action), generator, self.device)
             return dataclasses.replace(state, action=action)
         plans = self.planner is not None and self.planning
-        return self._recorded()[1](state, generator, (plans, deterministic))
+        with native.using(self.compile_mode, self.device):
+            return self._recorded()[1](state, generator, (plans, deterministic))
 
     @th.no_grad()
     def _choose(self, state: ActingState, generator: th.Generator | None, plans: bool, deterministic: bool) -> ActingState:

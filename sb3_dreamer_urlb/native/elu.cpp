@@ -2,7 +2,8 @@
 
 #include "vectors.h"
 
-static inline Floats elu(Floats x) { return x > 0.0f ? x : exp(x) - 1.0f; }
+// What is not a number passes as it is: exp below keeps only those that arithmetic makes.
+static inline Floats elu(Floats x) { return x <= 0.0f ? exp(x) - 1.0f : x; }
 
 // x ← ELU(x + bias), x (rows, columns); no bias: null.
 template <class T>

@@ -5,7 +5,9 @@
 #include <cstdint>
 #include <cstring>
 
+#if defined(__x86_64__)
 #include <immintrin.h>
+#endif
 #include <omp.h>
 
 #define EXPORT extern "C" __attribute__((visibility("default")))
