@@ -10,9 +10,11 @@
 // Sixteen logits with their bias; lanes beyond `count` are as impossible as can be.
 template <class T>
 static inline Floats logits_of(const T* logits, const float* bias, Index count) {
-    if (count >= LANES) return bias ? load(logits) + load(bias) : load(logits);
-    Floats x = bias ? load(logits, count) + load(bias, count) : load(logits, count);
-    for (Index i = count; i < LANES; i++) x[i] = -__builtin_inff();
+    Floats x = load_up_to(logits, count);
+    if (bias) x += load_up_to(bias, count);
+    if (count < LANES) {
+        for (Index i = count; i < LANES; i++) x[i] = -__builtin_inff();
+    }
     return x;
 }
 
@@ -34,10 +36,7 @@ template <class T>
     }
     if (probs) {
         const Floats scale = 1.0f / below;
-        for (Index i = 0; i < vectors; i++) {
-            if (size - i * LANES >= LANES) store(probs + i * LANES, weights[i] * scale);
-            else store(probs + i * LANES, weights[i] * scale, size - i * LANES);
-        }
+        for (Index i = 0; i < vectors; i++) store_up_to(probs + i * LANES, weights[i] * scale, size - i * LANES);
     }
     const Floats bound = below * uniform;
     // Sixty-four classes at a time: which of few it is cannot be foreseen.

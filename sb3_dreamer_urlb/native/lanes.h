@@ -3,6 +3,38 @@
 
 #include "vectors.h"
 
+// The first `count` lanes, 0 in the others; 16 or more: all.
+static inline Floats first_lanes(Floats x, Index count) {
+    const Ints lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+    return lane < (int32_t)count ? x : all(0);
+}
+
+// Sixteen numbers, or as many as there are left in a row: without a detour through memory where the processor can.
+#ifdef __AVX512BW__
+static inline __mmask16 lanes(Index count) { return count >= LANES ? 0xffff : (1 << count) - 1; }
+static inline Floats load_up_to(const float* p, Index count) { return (Floats)_mm512_maskz_loadu_ps(lanes(count), p); }
+static inline Floats load_up_to(const BF16* p, Index count) {
+    const __m256i shorts = _mm256_maskz_loadu_epi16(lanes(count), p);
+    return (Floats)_mm512_slli_epi32(_mm512_cvtepu16_epi32(shorts), 16);
+}
+static inline void store_up_to(float* p, Floats x, Index count) { _mm512_mask_storeu_ps(p, lanes(count), (__m512)x); }
+static inline void store_up_to(BF16* p, Floats x, Index count) {
+    BF16 some[LANES];
+    store(some, x);
+    _mm256_mask_storeu_epi16(p, lanes(count), read<__m256i>(some));
+}
+#else
+template <class T>
+static inline Floats load_up_to(const T* p, Index count) {
+    return count >= LANES ? load(p) : load(p, count);
+}
+template <class T>
+static inline void store_up_to(T* p, Floats x, Index count) {
+    if (count >= LANES) store(p, x);
+    else store(p, x, count);
+}
+#endif
+
 // Each lane's number and those of all lanes before it.
 static inline Floats running_sum(Floats x) {
 #ifdef __AVX512F__

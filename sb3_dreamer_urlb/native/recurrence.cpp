@@ -2,28 +2,20 @@
 
 #include "lanes.h"
 
-// Lanes of sixteen from `done` on.
-static inline Floats from_lane(Floats x, Index done) {
-    const Ints lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
-    return lane >= (int32_t)done ? x : all(0);
-}
-
-// The sum of some function of `size` ≥ 16 numbers; four sums at a time, because each addition waits for the one before.
+// The sum of some function of numbers; four sums at a time, because each addition waits for the one before.
 template <class T, class F>
 static inline float sum_of(const T* x, Index size, F of) {
     Floats sums[4] = {};
-    const Index tail = size % LANES, whole = size - tail;
     Index i = 0;
-    for (; i + 4 * LANES <= whole; i += 4 * LANES) {
+    for (; i + 4 * LANES <= size; i += 4 * LANES) {
         for (Index j = 0; j < 4; j++) sums[j] += of(load(x + i + j * LANES));
     }
-    for (; i < whole; i += LANES) sums[0] += of(load(x + i));
-    if (tail) sums[1] += from_lane(of(load(x + size - LANES)), LANES - tail);
+    for (; i < size; i += LANES) sums[0] += first_lanes(of(load_up_to(x + i, size - i)), size - i);
     return total((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
 // parts (rows, 3 · size) in the order reset, update, candidate, before their norm with weight and bias (3 · size); old (rows,
-// size), old_stride apart → deter (rows, size), and the same in T, short_stride apart. size ≥ 16.
+// size) → deter (rows, size), and the same in T, its rows short_stride apart.
 template <class T>
 static void recurrence(const T* parts, const float* weight, const float* bias, float epsilon, const float* old, float* deter, T* shorter,
                        Index short_stride, Index rows, Index size, int threads) {
@@ -33,18 +25,16 @@ static void recurrence(const T* parts, const float* weight, const float* bias, f
         const float mean = sum_of(row, 3 * size, [](Floats x) { return x; }) / (3 * size);
         const float variance = sum_of(row, 3 * size, [mean](Floats x) { return (x - mean) * (x - mean); }) / (3 * size);
         const float scale = 1.0f / __builtin_sqrtf(variance + epsilon);
-        for (Index next = 0; next < size; next += LANES) {
-            // The last sixteen may be some of those before once more.
-            const Index i = next < size - LANES ? next : size - LANES;
-            Floats part[3];
-            for (Index p = 0; p < 3; p++) {
-                const Index j = p * size + i;
-                part[p] = (load(row + j) - mean) * scale * load(weight + j) + load(bias + j);
-            }
-            const Floats candidate = tanh(sigmoid(part[0]) * part[2]), before = load(old + r * size + i);
-            const Floats now = before + sigmoid(part[1]) * (candidate - before);
-            store(deter + r * size + i, now);
-            store(shorter + r * short_stride + i, now);
+        auto normed = [&](Index i, Index count) {
+            return (load_up_to(row + i, count) - mean) * scale * load_up_to(weight + i, count) + load_up_to(bias + i, count);
+        };
+        for (Index i = 0; i < size; i += LANES) {
+            const Index count = size - i;
+            const Floats reset = normed(i, count), update = normed(size + i, count), candidate = normed(2 * size + i, count);
+            const Floats before = load_up_to(old + r * size + i, count);
+            const Floats now = before + sigmoid(update) * (tanh(sigmoid(reset) * candidate) - before);
+            store_up_to(deter + r * size + i, now, count);
+            store_up_to(shorter + r * short_stride + i, now, count);
         }
     }
 }
