@@ -1,5 +1,7 @@
 """ELU, the activation of every network of the agent: torch's where it is fast, cheaper arithmetic on CPUs.
 
+Where there are kernels of our own (native/), one pass over memory does it. What follows is for the other machines.
+
 torch computes exp(x) − 1 to the last bit (expm1), which costs seven times what exp in float32 does, and exp in bfloat16 costs
 more than in float32. Computed as exp(x) − 1 in float32, it is off by one rounding of 1 at most. Which of x and exp(x) − 1 is
 nearer to zero where x < 0, and the smaller where x > 0? The smaller one of their bits, read as signed integers, and that is
@@ -14,10 +16,17 @@ import torch.nn.functional as F
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.native import ops
+
 #: formats, and integers of the same size
 BITS = {th.float32: th.int32, th.bfloat16: th.int16}
 #: numbers that are not worth the calls
 SMALLEST = 2**16
+#: nor those of kernels of our own: without gradients, with gradients, and for the gradient itself, by format
+SMALLEST_NATIVE = 2**12
+SMALLEST_NATIVE_LEARNING = 2**14
+SMALLEST_NATIVE_GRADIENT = {th.bfloat16: 2**15}
 #: numbers that are done at once
 PIECE = 2**17
 
@@ -32,7 +41,7 @@ def elu_(x: th.Tensor) -> th.Tensor:
     if not _cheaper(x):
         return F.elu(x) if _learns(x) else F.elu_(x)
     if not _learns(x):
-        return _in_pieces(x)
+        return _in_place(x)
     y: th.Tensor = _ELU.apply(x)  # type: ignore[no-untyped-call]
     return y
 
@@ -42,7 +51,8 @@ class _ELU(Function):
     def forward(ctx: th.autograd.function.FunctionCtx, x: th.Tensor) -> th.Tensor:
         # Not ctx.mark_dirty: autograd refuses to overwrite what another Function gave out as a view. Hence nobody checks that
         # the input is not needed any more.
-        y = _in_pieces(x.data)
+        y = _in_place(x.data)
+        ctx.native = native.active()  # type: ignore[attr-defined]
         ctx.save_for_backward(y)
         return y
 
@@ -50,6 +60,10 @@ class _ELU(Function):
     @once_differentiable
     def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> th.Tensor:
         (y,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        enough = SMALLEST_NATIVE_GRADIENT.get(y.dtype)
+        if ctx.native and enough is not None and y.numel() >= enough and grad.stride() == y.stride():  # type: ignore[attr-defined]
+            ours: th.Tensor = ops.elu_backward(grad, y, False)[0]
+            return ours
         slope: th.Tensor = th.ops.aten.elu_backward(grad, 1.0, 1.0, 1.0, True, y)
         return slope
 
@@ -60,9 +74,19 @@ def _learns(x: th.Tensor) -> bool:
 
 def _cheaper(x: th.Tensor) -> bool:
     """Whether to compute it here. The numbers must lie in memory one after the other, in whatever order."""
-    if x.device.type != "cpu" or x.dtype not in BITS or x.numel() < SMALLEST:
+    smallest = SMALLEST
+    if native.active():
+        smallest = SMALLEST_NATIVE_LEARNING if _learns(x) else SMALLEST_NATIVE
+    if x.device.type != "cpu" or x.dtype not in BITS or x.numel() < smallest:
         return False
     return x.is_contiguous() or (x.dim() == 4 and x.is_contiguous(memory_format=th.channels_last))
+
+
+def _in_place(x: th.Tensor) -> th.Tensor:
+    if not native.active():
+        return _in_pieces(x)
+    ops.bias_elu_(x, None)
+    return x
 
 
 def _in_pieces(x: th.Tensor) -> th.Tensor:

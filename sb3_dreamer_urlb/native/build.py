@@ -61,7 +61,10 @@ def find_compiler() -> list[str]:
 
     :raises NativeUnavailable: where there is none
     """
-    chosen = shlex.split(os.environ.get("CXX", ""))
+    try:
+        chosen = shlex.split(os.environ.get("CXX", ""))
+    except ValueError as error:
+        raise NativeUnavailable(f"no C++ compiler: CXX is {os.environ['CXX']!r}: {error}") from error
     if chosen:
         if shutil.which(chosen[0]) is None:
             raise NativeUnavailable(f"no C++ compiler: CXX is {os.environ['CXX']!r}, and there is no such program")
