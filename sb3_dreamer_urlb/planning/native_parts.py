@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.native import planner_ops
-from sb3_dreamer_urlb.native.planner_ops import whole_lines
+from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.planning.prepared_parts import SampledState, in_order_of_use
@@ -30,8 +30,9 @@ class NativeHead:
     def __init__(self, mlp: MLP, variables: int, classes: int, dtype: th.dtype):
         first, *others = (cast(nn.Linear, layer) for layer in [*mlp.dense, mlp.out])
         stoch_size = variables * classes
-        self.rows = whole_lines(first.weight[:, :stoch_size].to(dtype).T)
-        self.bias = whole_lines(first.bias.to(dtype))
+        rows_dtype = rows_format(dtype)
+        self.rows = whole_lines(first.weight[:, :stoch_size].T, rows_dtype)
+        self.bias = whole_lines(first.bias, rows_dtype)
         self.rest = PrepackedLinear(first.weight[:, stoch_size:], None, dtype)
         self.layers = [PrepackedLinear(layer.weight, layer.bias, dtype) for layer in others]
 
@@ -56,9 +57,10 @@ class NativeDynamics:
     def __init__(self, rssm: RSSM, stoch_rows: th.Tensor, dtype: th.dtype):
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
         self.hidden_size, self.deter_size = rssm.input.out_features, rssm.deter_size
-        self.rows = whole_lines(stoch_rows.to(dtype))
-        self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].to(dtype).T)
-        self.bias = whole_lines(rssm.input.bias.to(dtype))
+        rows_dtype = rows_format(dtype)
+        self.rows = whole_lines(stoch_rows, rows_dtype)
+        self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].T, rows_dtype)
+        self.bias = whole_lines(rssm.input.bias, rows_dtype)
         self.gru, self.norm = in_order_of_use(rssm, dtype)
         self.epsilon = rssm.gru_norm.eps
         self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
@@ -84,7 +86,8 @@ class NativeDynamics:
     def _start_part(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
         """Computed once: each iteration of a plan begins with the same states."""
         if self._start is not state:
-            part = (state.stoch.to(self.dtype) @ self.rows)[:, : self.hidden_size].contiguous()
+            rows = self.rows[:, : self.hidden_size].to(self.dtype)
+            part = state.stoch.to(self.dtype) @ rows
             inputs, short = self._inputs(state.deter)
             short.copy_(state.deter)
             self._start, self._parts = state, (part, inputs)
