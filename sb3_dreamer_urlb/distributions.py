@@ -58,7 +58,8 @@ def draw_classes_of_logits(logits: th.Tensor, generator: th.Generator | None = N
     :return: class indices, counted through all S · K, int64 (…, S)
     """
     uniform = th.rand(logits.shape[:-1], generator=generator)
-    return planner_ops.draws(logits, None, uniform, True, False)[0]
+    classes: th.Tensor = planner_ops.draws(logits, None, uniform, True, False)[0]
+    return classes
 
 
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:

@@ -92,7 +92,8 @@ def _whole(width: int, dtype: th.dtype) -> int:
 
 
 @ops.operator(
-    "gather(Tensor rows, Tensor? classes, Tensor? others, Tensor? x, Tensor? bias, Tensor? addend, bool elu, Tensor(a!) out) -> ()"
+    "gather(Tensor rows, Tensor? classes, Tensor? others, Tensor? x, Tensor? bias, Tensor? addend, bool elu, Tensor(a!) out)"
+    " -> ()"
 )
 def gather(
     rows: th.Tensor,
@@ -143,9 +144,7 @@ def gather(
     )
 
 
-@ops.operator(
-    "recurrence(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old, Tensor(a!) short) -> Tensor"
-)
+@ops.operator("recurrence(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old, Tensor(a!) short) -> Tensor")
 def recurrence(
     parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor, short: th.Tensor
 ) -> th.Tensor:
@@ -171,7 +170,8 @@ def recurrence(
     new = th.empty_like(old)
     places = [tensor.data_ptr() for tensor in (parts, weight, bias)]
     function(
-        *(*places, epsilon, old.data_ptr(), new.data_ptr(), short.data_ptr(), short.stride(0)), *(n, size, th.get_num_threads())
+        *(*places, epsilon, old.data_ptr(), new.data_ptr(), short.data_ptr(), short.stride(0)),
+        *(n, size, th.get_num_threads()),
     )
     return new
 

@@ -68,15 +68,13 @@ class NativeDynamics:
         self._start: LatentState | None = None
 
     def step(self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None) -> SampledState:
-        classes = addend = None
+        before = addend = None
         if isinstance(state, LatentState):
             addend, inputs = self._start_part(state)
         else:
-            classes, inputs = state.classes, state.inputs
-            assert inputs is not None
-        planner_ops.gather(
-            self.rows, classes, self.action_rows, action, self.bias, addend, True, inputs[:, : self.hidden_size]
-        )
+            assert state.inputs is not None
+            before, inputs = state.classes, state.inputs
+        planner_ops.gather(self.rows, before, self.action_rows, action, self.bias, addend, True, inputs[:, : self.hidden_size])
         next_inputs, short = self._inputs(inputs)
         deter = planner_ops.recurrence(self.gru(inputs), *self.norm, self.epsilon, state.deter, short)
         logits = self.logits(self.hidden(short, elu=True)).view(-1, *self.shape)
