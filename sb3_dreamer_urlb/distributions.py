@@ -1,7 +1,7 @@
 """Random draws and the three densities of the agent: one-hot categorical, bounded normal, unit-variance normal.
 
-Every draw of the whole agent goes through ``draw_classes`` and ``draw_normal``, called through this module, so a test
-can make the agent deterministic by replacing those two functions.
+Every draw of the whole agent goes through ``draw_classes``, ``draw_classes_of_logits`` and ``draw_normal``, called through
+this module, so a test can make the agent deterministic by replacing those three functions.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import torch as th
 import torch.nn.functional as F
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
+
+from sb3_dreamer_urlb.native import planner_ops
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 ACTION_MARGIN = 1e-6
@@ -46,6 +48,18 @@ def _draw_by_counting(probs: th.Tensor, generator: th.Generator | None) -> th.Te
     bound = th.empty_like(by_class[-1]).uniform_(generator=generator).mul_(by_class[-1])
     # In place a comparison gives numbers, which are faster to count than booleans.
     return cdf.le_(bound.unsqueeze(-2)).sum(-2).clamp_(max=len(by_class) - 1).movedim(-1, 0).long()
+
+
+def draw_classes_of_logits(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+    """Draw one class per categorical with a kernel of our own, only inside ``native.using()``.
+
+    :param logits: float32 or bfloat16 (…, S, K), contiguous
+    :param generator: source of randomness, the global one if None
+    :return: class indices, counted through all S · K, int64 (…, S)
+    """
+    uniform = th.rand(logits.shape[:-1], generator=generator)
+    classes: th.Tensor = planner_ops.draws(logits, None, uniform, True, False)[0]
+    return classes
 
 
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:

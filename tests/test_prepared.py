@@ -9,7 +9,7 @@ from golden import deterministic_draws
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.planning import prepacked, prepared
+from sb3_dreamer_urlb.planning import prepacked, prepared, prepared_parts
 from sb3_dreamer_urlb.planning.prepared import PreparedAgent, planned
 from sb3_dreamer_urlb.types import LatentState
 
@@ -19,7 +19,7 @@ N, M = 2, 6
 @pytest.fixture(params=[(None, False), (None, True), ("diayn", False), ("aps", False)], ids=str)
 def agents(request, world_model, monkeypatch):
     """The plain and the prepared form of one agent with N environments; several blocks of everything."""
-    monkeypatch.setattr(prepared, "BLOCK", 2)
+    monkeypatch.setattr(prepared_parts, "BLOCK", 2)
     monkeypatch.setattr(prepared, "ROWS", 5)
     method, discount_head = request.param
     agent = Agent(world_model(discount_head=discount_head), [8, 8], make_intrinsic_reward(method, {}))

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import torch as th
 
-from sb3_dreamer_urlb.native import ops, product_ops
+from sb3_dreamer_urlb.native import ops, planner_ops, product_ops
 from sb3_dreamer_urlb.native.build import NativeUnavailable, load
 
 #: values of ``compile`` that use them
@@ -76,6 +76,11 @@ def describe(compile: str, device: th.device | str) -> str:
         return f"torch's (compile={compile!r})"
     reason = why_not(device)
     return "native where they are faster, torch's elsewhere" if reason is None else f"torch's ({reason})"
+
+
+def plans() -> bool:
+    """Whether to plan with kernels of our own, here and now: they need more of a processor than the others."""
+    return active() and planner_ops.fast()
 
 
 def _to_be_had(compile: str, device: th.device | str) -> bool:

@@ -19,7 +19,7 @@ from sb3_dreamer_urlb.native.build import NativeUnavailable
 LIBRARY = th.library.Library("sb3_dreamer_urlb", "DEF")
 #: formats, as the C functions' names end
 FORMATS = {th.float32: "float", th.bfloat16: "bfloat16"}
-_POINTER, _INDEX, _INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
+_POINTER, _INDEX, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int, ctypes.c_float
 #: arguments of the C functions; one a format where the name ends in _
 ARGUMENTS: dict[str, tuple[Any, ...]] = {
     "bias_elu_": (_POINTER, _POINTER, _INDEX, _INDEX, _INT),
@@ -49,7 +49,7 @@ def bind(library: ctypes.CDLL) -> None:
                 function = getattr(library, full_name)
             except AttributeError as error:
                 raise NativeUnavailable(f"the library has no function {full_name}") from error
-            function.argtypes, function.restype = arguments, None
+            function.argtypes, function.restype = arguments, ctypes.c_int if name.startswith("has_") else None
             found[full_name] = function
     _functions.update(found)
 

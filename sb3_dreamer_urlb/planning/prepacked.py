@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch as th
 import torch.nn.functional as F
 
+from sb3_dreamer_urlb.activation import elu_
+
 
 class PrepackedLinear:
     """x · weightᵀ + bias. oneDNN orders weights its own way before each product; here it does so once.
@@ -23,12 +25,17 @@ class PrepackedLinear:
         if th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight"):
             self.packed = th.ops.mkldnn._reorder_linear_weight(self.weight.contiguous(), None)
 
-    def __call__(self, x: th.Tensor, plus: th.Tensor | None = None) -> th.Tensor:
+    def __call__(self, x: th.Tensor, plus: th.Tensor | None = None, elu: bool = False) -> th.Tensor:
         """
         :param x: (n, inputs), in the format of products
         :param plus: added to the result in the same pass, (n, outputs)
+        :param elu: whether to apply ELU to the result
         :return: (n, outputs), in the format of products
         """
+        y = self._product(x, plus)
+        return elu_(y) if elu else y
+
+    def _product(self, x: th.Tensor, plus: th.Tensor | None) -> th.Tensor:
         y: th.Tensor
         if self.packed is None:
             y = F.linear(x, self.weight, self.bias)

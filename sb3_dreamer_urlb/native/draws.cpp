@@ -1,0 +1,110 @@
+// One class a variable, drawn by inverting the cumulative distribution of exp(logit - the variable's largest).
+//
+// The class is the first whose cumulative weight exceeds uniform · all weights. Running sums are made in pieces, so they may
+// shrink by a rounding where a weight is 0: such a class is never the first.
+
+#include "lanes.h"
+
+#include <vector>
+
+// Sixteen logits with their bias; lanes beyond `count` are as impossible as can be.
+template <class T>
+static inline Floats logits_of(const T* logits, const float* bias, Index count) {
+    Floats x = load_up_to(logits, count);
+    if (bias) x += load_up_to(bias, count);
+    if (count < LANES) {
+        for (Index i = count; i < LANES; i++) x[i] = -__builtin_inff();
+    }
+    return x;
+}
+
+// One variable, with its numbers in `vectors` vectors.
+template <class T>
+[[gnu::always_inline]] static inline Index draw(const T* logits, const float* bias, float uniform, Floats* weights, Floats* cdf, const Index vectors,
+                         const Index size, float* probs) {
+    Floats most = all(-__builtin_inff());
+    for (Index i = 0; i < vectors; i++) {
+        weights[i] = logits_of(logits + i * LANES, bias ? bias + i * LANES : nullptr, size - i * LANES);
+        most = larger(weights[i], most);
+    }
+    most = largest(most);
+    Floats below = all(0);
+    for (Index i = 0; i < vectors; i++) {
+        weights[i] = exp_or_zero(weights[i] - most);
+        cdf[i] = running_sum(weights[i]) + below;
+        below = last(cdf[i]);
+    }
+    if (probs) {
+        const Floats scale = 1.0f / below;
+        for (Index i = 0; i < vectors; i++) store_up_to(probs + i * LANES, weights[i] * scale, size - i * LANES);
+    }
+    const Floats bound = below * uniform;
+    // Sixty-four classes at a time: which of few it is cannot be foreseen.
+    for (Index begin = 0; begin < vectors; begin += 4) {
+        uint64_t found = 0;
+        for (Index i = begin; i < vectors && i < begin + 4; i++) {
+            found |= uint64_t(where_greater(cdf[i], bound) & where_greater(weights[i], all(0))) << (i - begin) * LANES;
+        }
+        if (found) return begin * LANES + __builtin_ctzll(found);
+    }
+    // The uniform number was rounded to 1; or there is something that is not a number, and any class will do.
+    for (Index i = vectors; i-- > 0;) {
+        const uint32_t possible = where_greater(weights[i], all(0));
+        if (possible) return i * LANES + 31 - __builtin_clz(possible);
+    }
+    return 0;
+}
+
+template <int VECTORS, bool BIAS, bool PROBS, class T>
+static void draws(const T* logits, const float* bias, const float* uniform, Index* classes, float* probs, Index rows, Index variables,
+                  Index size, Index step, int threads) {
+    const Index vectors = VECTORS ? VECTORS : (size + LANES - 1) / LANES;
+#pragma omp parallel num_threads(threads) if (rows * variables * size > WORTH_A_THREAD)
+    {
+        std::vector<Floats> room(VECTORS ? 0 : 2 * vectors);
+#pragma omp for schedule(static)
+        for (Index r = 0; r < rows; r++) {
+            for (Index v = 0; v < variables; v++) {
+                const Index place = r * variables + v;
+                const T* its = logits + place * size;
+                const float* its_bias = BIAS ? bias + v * size : nullptr;
+                float* its_probs = PROBS ? probs + place * size : nullptr;
+                if constexpr (VECTORS) {
+                    Floats weights[VECTORS], cdf[VECTORS];
+                    classes[place] = v * step + draw(its, its_bias, uniform[place], weights, cdf, VECTORS, VECTORS * LANES, its_probs);
+                } else {
+                    classes[place] =
+                        v * step + draw(its, its_bias, uniform[place], room.data(), room.data() + vectors, vectors, size, its_probs);
+                }
+            }
+        }
+    }
+}
+
+template <int VECTORS, class T>
+static void draws(const T* logits, const float* bias, const float* uniform, Index* classes, float* probs, Index rows, Index variables,
+                  Index size, Index step, int threads) {
+    auto its = bias ? probs ? draws<VECTORS, true, true, T> : draws<VECTORS, true, false, T>
+                    : probs ? draws<VECTORS, false, true, T> : draws<VECTORS, false, false, T>;
+    its(logits, bias, uniform, classes, probs, rows, variables, size, step, threads);
+}
+
+// logits (rows, variables, size), bias (variables, size) or null, uniform (rows, variables) in [0, 1) → classes (rows, variables),
+// `step` more for each variable than for the one before; probs (rows, variables, size) or null for none.
+#define FOR(T, NAME)                                                                                                       \
+    EXPORT void draws_##NAME(const T* logits, const float* bias, const float* uniform, Index* classes, float* probs,       \
+                             Index rows, Index variables, Index size, Index step, int threads) {                           \
+        auto its = size == 32 ? draws<2, T> : size == 16 ? draws<1, T> : size == 64 ? draws<4, T> : draws<0, T>;           \
+        its(logits, bias, uniform, classes, probs, rows, variables, size, step, threads);                                  \
+    }
+FOR(float, float)
+FOR(BF16, bfloat16)
+
+// Whether the draws, sums and gates are made for this processor; elsewhere they are right, but slow.
+EXPORT int has_lanes() {
+#ifdef __AVX512DQ__
+    return 1;
+#else
+    return 0;
+#endif
+}

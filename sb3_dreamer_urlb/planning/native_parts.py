@@ -1,0 +1,97 @@
+"""The parts of ``prepared_parts`` with kernels of our own (native/), which do in one pass what torch does in several."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch as th
+from torch import nn
+
+from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.native import planner_ops
+from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
+from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
+from sb3_dreamer_urlb.planning.prepared_parts import SampledState, in_order_of_use
+from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.types import LatentState
+from sb3_dreamer_urlb.world_model.rssm import RSSM
+
+
+class NativeHead:
+    """An MLP that reads sampled states.
+
+    :param mlp: the network
+    :param variables: S
+    :param classes: K
+    :param dtype: of products
+    """
+
+    def __init__(self, mlp: MLP, variables: int, classes: int, dtype: th.dtype):
+        first, *others = (cast(nn.Linear, layer) for layer in [*mlp.dense, mlp.out])
+        stoch_size = variables * classes
+        rows_dtype = rows_format(dtype)
+        self.rows = whole_lines(first.weight[:, :stoch_size].T, rows_dtype)
+        self.bias = whole_lines(first.bias, rows_dtype)
+        self.rest = PrepackedLinear(first.weight[:, stoch_size:], None, dtype)
+        self.layers = [PrepackedLinear(layer.weight, layer.bias, dtype) for layer in others]
+
+    def __call__(self, classes: th.Tensor, rest: th.Tensor) -> th.Tensor:
+        """Classes (n, S) and what else the first layer reads, (n, D) or with a skill (n, D + W) → float (n, outputs)."""
+        x = self.rest(rest)
+        planner_ops.gather(self.rows, classes, None, None, self.bias, x, True, x)
+        *hidden, out = self.layers
+        for layer in hidden:
+            x = layer(x, elu=True)
+        return full(out(x))
+
+
+class NativeDynamics:
+    """The RSSM's prior step.
+
+    :param rssm: the network
+    :param stoch_rows: its :meth:`~sb3_dreamer_urlb.world_model.rssm.RSSM.stoch_rows`
+    :param dtype: of products
+    """
+
+    def __init__(self, rssm: RSSM, stoch_rows: th.Tensor, dtype: th.dtype):
+        self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
+        self.hidden_size, self.deter_size = rssm.input.out_features, rssm.deter_size
+        rows_dtype = rows_format(dtype)
+        self.rows = whole_lines(stoch_rows, rows_dtype)
+        self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].T, rows_dtype)
+        self.bias = whole_lines(rssm.input.bias, rows_dtype)
+        self.gru, self.norm = in_order_of_use(rssm, dtype)
+        self.epsilon = rssm.gru_norm.eps
+        self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
+        self.logits = PrepackedLinear(rssm.prior_logits.weight, rssm.prior_logits.bias, dtype)
+        self._start: LatentState | None = None
+
+    def step(self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None) -> SampledState:
+        before = addend = None
+        if isinstance(state, LatentState):
+            addend, inputs = self._start_part(state)
+        else:
+            assert state.inputs is not None
+            before, inputs = state.classes, state.inputs
+        planner_ops.gather(self.rows, before, self.action_rows, action, self.bias, addend, True, inputs[:, : self.hidden_size])
+        next_inputs, short = self._inputs(inputs)
+        deter = planner_ops.recurrence(self.gru(inputs), *self.norm, self.epsilon, state.deter, short)
+        logits = self.logits(self.hidden(short, elu=True)).view(-1, *self.shape)
+        classes = distributions.draw_classes_of_logits(logits, generator)
+        return SampledState(classes, deter, short, self.stoch_size, next_inputs)
+
+    def _start_part(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+        """Computed once: each iteration of a plan begins with the same states."""
+        if self._start is not state:
+            rows = self.rows[:, : self.hidden_size].to(self.dtype)
+            part = state.stoch.to(self.dtype) @ rows
+            inputs, short = self._inputs(state.deter)
+            short.copy_(state.deter)
+            self._start, self._parts = state, (part, inputs)
+        return self._parts
+
+    def _inputs(self, like: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Room for what the GRU reads, and the part of it that is the deterministic state."""
+        inputs = like.new_empty(len(like), self.hidden_size + self.deter_size, dtype=self.dtype)
+        return inputs, inputs[:, self.hidden_size :]
