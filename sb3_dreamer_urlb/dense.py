@@ -77,7 +77,8 @@ class _Layer(Function):
         weight = weight.to(x.dtype)
         y: th.Tensor = product_ops.rows_by_weights(x, product_ops.lay_out_weights(weight, False), len(weight), bias, None, elu)
         wants_weight = ctx.needs_input_grad[1]  # type: ignore[attr-defined]
-        ctx.save_for_backward(x if wants_weight else None, weight, y if elu else None)
+        # torch takes None for "nothing to keep", its types do not.
+        ctx.save_for_backward(x if wants_weight else None, weight, y if elu else None)  # type: ignore[arg-type]
         return y
 
     @staticmethod

@@ -1,7 +1,7 @@
 """Random draws and the three densities of the agent: one-hot categorical, bounded normal, unit-variance normal.
 
-Every draw of the whole agent goes through ``draw_classes``, ``draw_classes_of_logits`` and ``draw_normal``, called through
-this module, so a test can make the agent deterministic by replacing those three functions.
+Every draw of the whole agent goes through ``draw_classes``, ``draw_classes_of_logits``, ``draw_classes_and_probs`` and
+``draw_normal``, called through this module, so a test can make the agent deterministic by replacing those four functions.
 """
 
 from __future__ import annotations
@@ -12,12 +12,16 @@ from collections.abc import Sequence
 import torch as th
 import torch.nn.functional as F
 from torch.autograd import Function
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import FunctionCtx, once_differentiable
 
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import planner_ops
+from sb3_dreamer_urlb.precision import full
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 ACTION_MARGIN = 1e-6
+#: logits from which on kernels of our own pay
+NATIVE_SIZE = 2**14
 
 
 def draw_classes(probs: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
@@ -62,6 +66,18 @@ def draw_classes_of_logits(logits: th.Tensor, generator: th.Generator | None = N
     return classes
 
 
+def draw_classes_and_probs(logits: th.Tensor, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor]:
+    """Draw one class per categorical with a kernel of our own, only inside ``native.using()``.
+
+    :param logits: float32 or bfloat16 (…, S, K), contiguous
+    :param generator: source of randomness, the global one if None
+    :return: class indices of each categorical, int64 (…, S), and probabilities, float32 (…, S, K)
+    """
+    uniform = th.rand(logits.shape[:-1], generator=generator)
+    classes, probs = planner_ops.draws(logits, None, uniform, False, True)
+    return classes, probs
+
+
 def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
     """Standard normal noise.
 
@@ -75,28 +91,47 @@ def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th
 def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
     """Draw one-hot vectors with straight-through gradients (DreamerV2): forward the draw, backward the probabilities.
 
-    :param logits: (…, S, K)
+    :param logits: (…, S, K); float32, or the short format of products
     :param generator: source of randomness
-    :return: one-hot float (…, S, K)
+    :return: one-hot (…, S, K), in the format of the logits
     """
-    probs = logits.softmax(-1)
-    one_hot = one_hot_like(probs, draw_classes(probs.detach(), generator))
+    if native.plans() and logits.device.type == "cpu" and logits.numel() >= NATIVE_SIZE:
+        drawn: th.Tensor = _Sample.apply(logits.contiguous(), generator)  # type: ignore[no-untyped-call]
+        return drawn
+    probs = full(logits).softmax(-1)
+    one_hot = one_hot_like(probs, draw_classes(probs.detach(), generator)).to(logits.dtype)
     if not probs.requires_grad:
         return one_hot
     sample: th.Tensor = _StraightThrough.apply(one_hot, probs)  # type: ignore[no-untyped-call]
     return sample
 
 
+class _Sample(Function):
+    """A one-hot draw from logits, with the gradient of their probabilities, by kernels of our own."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, logits: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        classes, probs = draw_classes_and_probs(logits, generator)
+        ctx.save_for_backward(probs)
+        return one_hot_like(logits, classes)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
+        (probs,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return planner_ops.softmax_backward(grad.contiguous(), probs), None
+
+
 class _StraightThrough(Function):
     """The first argument, with the gradient of the second."""
 
     @staticmethod
-    def forward(ctx: th.autograd.function.FunctionCtx, value: th.Tensor, slope: th.Tensor) -> th.Tensor:
+    def forward(ctx: FunctionCtx, value: th.Tensor, slope: th.Tensor) -> th.Tensor:
         return value.view_as(value)
 
     @staticmethod
-    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[None, th.Tensor]:
-        return None, grad
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[None, th.Tensor]:
+        return None, full(grad)
 
 
 def one_hot_like(probs: th.Tensor, classes: th.Tensor) -> th.Tensor:
@@ -138,7 +173,7 @@ class _SquaredDistance(Function):
     """Of all images together. torch's own loss hands its gradient on in another memory layout than the images have."""
 
     @staticmethod
-    def forward(ctx: th.autograd.function.FunctionCtx, mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+    def forward(ctx: FunctionCtx, mean: th.Tensor, target: th.Tensor) -> th.Tensor:
         difference = mean - target
         ctx.save_for_backward(difference)
         distance: th.Tensor = th.linalg.vector_norm(difference, dim=(-3, -2, -1))
@@ -146,7 +181,7 @@ class _SquaredDistance(Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor, None]:
         (difference,) = ctx.saved_tensors  # type: ignore[attr-defined]
         return difference * (2 * grad), None
 

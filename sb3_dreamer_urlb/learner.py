@@ -190,10 +190,8 @@ class Learner:
             imagination, log_prob = self._imagine(start, skill)
             raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
             reward = agent.reward_normalizer(raw_reward)
-            # Once for both critics.
-            feature = imagination.feature.to(self.dtype)
-            discount = agent.world_model.discount(imagination.feature, goes_on)
-            value = agent.slow_critic(feature, skill)
+            discount = agent.world_model.discount(imagination.seen, goes_on)
+            value = agent.slow_critic(imagination.seen, skill)
             weight = actor_critic.discount_weights(discount.detach())
             returns = lambda_return(reward[:-1], value, discount[:-1], config.gae_lambda)
             target = actor_critic.with_entropy_bonus(returns, imagination.entropy, config.ent_coef)
@@ -205,7 +203,7 @@ class Learner:
                 loss = actor_critic.reinforce_loss(target, value, chosen, log_prob, imagination.entropy, config.ent_coef)
         actor_grad_norm = self.actor_optimizer.step(loss)
         with self._products():
-            value_now = agent.critic(feature[:-1].detach(), skill)
+            value_now = agent.critic(imagination.seen[:-1].detach(), skill)
             critic_loss = agent.critic.loss(value_now, target.detach(), weight)
         critic_grad_norm = self.critic_optimizer.step(critic_loss)
         return {
@@ -225,7 +223,7 @@ class Learner:
         with th.no_grad():
             imagination = agent.world_model.imagine(agent.actor, start, horizon, skill)
         # Once more with gradients, in one pass over all steps.
-        policy = agent.actor(imagination.feature[:-1], skill)
+        policy = agent.actor(imagination.seen[:-1], skill)
         return replace(imagination, entropy=policy.entropy()), policy.log_prob(imagination.action[1:])
 
 

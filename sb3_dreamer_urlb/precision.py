@@ -39,6 +39,14 @@ def products(device: th.device | str, dtype: th.dtype) -> th.autocast:
     return th.autocast(th.device(device).type, th.bfloat16, enabled=dtype == th.bfloat16)
 
 
+def short(x: th.Tensor) -> th.Tensor:
+    """In the format of products here and now, as :func:`products` set it; gradients come back in x's own."""
+    device = x.device.type
+    if not th.amp.is_autocast_available(device) or not th.is_autocast_enabled(device):
+        return x
+    return x.to(th.get_autocast_dtype(device))
+
+
 def full(x: th.Tensor) -> th.Tensor:
     """Back to float32 behind a product; anything but bfloat16 passes as it is."""
     return x.float() if x.dtype == th.bfloat16 else x

@@ -116,16 +116,21 @@ class Posterior:
 class Imagination:
     """Trajectories dreamt by the actor inside the model, time first.
 
-    :param feature: float (H + 1, N, F) of z_0 … z_H; z_0 is where the dream starts
+    :param seen: what networks see of z_0 … z_H, in the format of their products, (H + 1, N, F); z_0 is where the dream starts
     :param action: float (H + 1, N, A); action t led to state t, so the first is zero
     :param entropy: of the actor at z_0 … z_{H-1} in nats, float (H, N)
     :param skill: that the actor followed, float (N, W), None without skills
     """
 
-    feature: th.Tensor
+    seen: th.Tensor
     action: th.Tensor
     entropy: th.Tensor
     skill: th.Tensor | None = None
+
+    @property
+    def feature(self) -> th.Tensor:
+        """z_0 … z_H, float (H + 1, N, F). Networks read ``seen`` just as well, without a copy."""
+        return self.seen.float()
 
 
 @dataclass(frozen=True)

@@ -229,12 +229,17 @@ def _most_probable(logits: th.Tensor, generator: th.Generator | None = None) -> 
     return logits.argmax(-1) + th.arange(logits.shape[-2]) * logits.shape[-1]
 
 
+def _most_probable_and_probs(logits: th.Tensor, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor]:
+    return logits.argmax(-1), logits.float().softmax(-1)
+
+
 @contextmanager
 def deterministic_draws() -> Iterator[None]:
     """A categorical draw is its most probable class, an actor's draw its mean."""
     with (
         mock.patch.object(distributions, "draw_classes", lambda probs, generator=None: probs.argmax(-1)),
         mock.patch.object(distributions, "draw_classes_of_logits", _most_probable),
+        mock.patch.object(distributions, "draw_classes_and_probs", _most_probable_and_probs),
         mock.patch.object(distributions, "draw_normal", lambda shape, like, generator=None: like.new_zeros(shape)),
     ):
         yield

@@ -55,7 +55,7 @@ class APS(SkillReward):
     def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
         assert imagination.skill is not None
         with th.no_grad():
-            phi = self.features(imagination.feature)
+            phi = self.features(imagination.seen)
             follows = (F.normalize(phi, dim=-1) * imagination.skill).sum(-1)
             return self._entropy(phi.flatten(0, 1)).view(phi.shape[:2]) + follows
 

@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
 from sb3_dreamer_urlb.intrinsic.particles import check_neighbours, knn_distances
+from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import Imagination, ModelSizes
 
 
@@ -31,6 +32,6 @@ class APT(IntrinsicReward):
         self.deter_size = sizes.deter
 
     def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
-        deter = imagination.feature[..., -self.deter_size :]
+        deter = full(imagination.seen[..., -self.deter_size :])
         distance = knn_distances(deter.detach().flatten(0, 1), self.k)
         return distance.mean(-1).log1p().view(deter.shape[:2])

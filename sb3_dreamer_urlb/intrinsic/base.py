@@ -51,7 +51,7 @@ class RewardSource(nn.Module):
         :param imagination: what the actor dreamt
         :param reward_head: of the world model
         """
-        return reward_head(imagination.feature)
+        return reward_head(imagination.seen)
 
 
 class IntrinsicReward(RewardSource):

@@ -43,7 +43,7 @@ class DIAYN(SkillReward):
     def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
         """log q(w | z) + log W: skills are drawn uniformly."""
         assert imagination.skill is not None
-        log_q = self.discriminator(imagination.feature).log_softmax(-1)
+        log_q = self.discriminator(imagination.seen).log_softmax(-1)
         return (log_q * imagination.skill).sum(-1) + math.log(self.skills.dim)
 
     def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:

@@ -25,4 +25,4 @@ class LBS(IntrinsicReward):
         return loss, {}
 
     def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
-        return self.surprise(imagination.feature)
+        return self.surprise(imagination.seen)

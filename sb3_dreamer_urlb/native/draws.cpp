@@ -100,6 +100,31 @@ static void draws(const T* logits, const float* bias, const float* uniform, Inde
 FOR(float, float)
 FOR(BF16, bfloat16)
 
+// out ← probs · (grad - the mean of grad under probs), each row of `size` for itself: the gradient of a softmax.
+template <class T>
+static void softmax_backward(const T* grad, const float* probs, T* out, Index rows, Index size, int threads) {
+#pragma omp parallel for num_threads(threads) if (rows * size > WORTH_A_THREAD) schedule(static)
+    for (Index r = 0; r < rows; r++) {
+        const Index begin = r * size, whole = size / LANES * LANES;
+        Floats sums = all(0);
+        for (Index i = begin; i < begin + whole; i += LANES) sums += load(grad + i) * load(probs + i);
+        if (whole < size) sums += load_up_to(grad + begin + whole, size - whole) * load_up_to(probs + begin + whole, size - whole);
+        const float mean = total(sums);
+        for (Index i = begin; i < begin + whole; i += LANES) store(out + i, load(probs + i) * (load(grad + i) - mean));
+        if (whole < size) {
+            const Floats p = load_up_to(probs + begin + whole, size - whole);
+            store_up_to(out + begin + whole, p * (load_up_to(grad + begin + whole, size - whole) - mean), size - whole);
+        }
+    }
+}
+
+EXPORT void softmax_backward_float(const float* grad, const float* probs, float* out, Index rows, Index size, int threads) {
+    softmax_backward(grad, probs, out, rows, size, threads);
+}
+EXPORT void softmax_backward_bfloat16(const BF16* grad, const float* probs, BF16* out, Index rows, Index size, int threads) {
+    softmax_backward(grad, probs, out, rows, size, threads);
+}
+
 // Whether the draws, sums and gates are made for this processor; elsewhere they are right, but slow.
 EXPORT int has_lanes() {
 #ifdef __AVX512DQ__

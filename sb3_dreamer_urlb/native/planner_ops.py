@@ -24,6 +24,7 @@ ops.ARGUMENTS.update(
         "draws_": (*[_POINTER] * 5, *[_INDEX] * 4, _INT),
         "gather_": GATHER,
         "gather_half": GATHER,
+        "softmax_backward_": (_POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
         "recurrence_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
     }
 )
@@ -74,6 +75,24 @@ def rows_format(dtype: th.dtype) -> th.dtype:
     """Of rows whose sums are asked for in ``dtype``: float16 in place of bfloat16 where the processor adds such numbers, twice
     as fast and more exactly, as long as weights stay below 16 000."""
     return th.float16 if dtype == th.bfloat16 and ops._function("has_halves")() else dtype
+
+
+@ops.operator("softmax_backward(Tensor grad, Tensor probs) -> Tensor")
+def softmax_backward(grad: th.Tensor, probs: th.Tensor) -> th.Tensor:
+    """The gradient of logits from that of their probabilities.
+
+    :param grad: float32 or bfloat16 (…, K), contiguous
+    :param probs: float32, of the same shape, contiguous
+    :return: as ``grad``
+    """
+    function = ops._of_format("softmax_backward_", grad)
+    ops._check_dense(grad)
+    _check("probabilities", probs, th.float32, tuple(grad.shape))
+    out, size = th.empty_like(grad), grad.shape[-1]
+    if grad.numel():
+        places = [tensor.data_ptr() for tensor in (grad, probs, out)]
+        function(*places, grad.numel() // size, size, th.get_num_threads())
+    return out
 
 
 def whole_lines(rows: th.Tensor, dtype: th.dtype) -> th.Tensor:

@@ -55,10 +55,10 @@ class RSSM(nn.Module):
         :param state: z_{t-1}, (n, …)
         :param action: a_{t-1}, float (n, A)
         :param generator: source of randomness
-        :return: a sample of z_t, (n, …)
+        :return: a sample of z_t, (n, …), its stochastic part in the format of products
         """
         deter = self._recur(state, self._action_part(action))
-        return LatentState(self._sample(self._prior(deter), generator), deter)
+        return LatentState(self._sample(self._prior_logits(deter), generator), deter)
 
     def planning_step(
         self, state: LatentState, action: th.Tensor, stoch_rows: th.Tensor, generator: th.Generator | None = None
@@ -148,9 +148,11 @@ class RSSM(nn.Module):
         return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
 
     def _prior(self, deter: th.Tensor) -> th.Tensor:
+        return full(self._prior_logits(deter))
+
+    def _prior_logits(self, deter: th.Tensor) -> th.Tensor:
         hidden = linear_elu(deter, self.prior_hidden.weight, self.prior_hidden.bias)
-        logits = linear(hidden, self.prior_logits.weight, self.prior_logits.bias)
-        return full(logits).view(deter.shape[:-1] + self.logits_shape)
+        return linear(hidden, self.prior_logits.weight, self.prior_logits.bias).view(deter.shape[:-1] + self.logits_shape)
 
     def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
         hidden = elu_(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)

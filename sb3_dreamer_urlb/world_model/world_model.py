@@ -11,6 +11,7 @@ from torch import nn
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
 from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.precision import short
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Observation, Posterior
 from sb3_dreamer_urlb.world_model.observations import Observations
 from sb3_dreamer_urlb.world_model.rssm import RSSM
@@ -139,15 +140,15 @@ class WorldModel(nn.Module):
         """
         state = start
         action = start.deter.new_zeros(start.deter.shape[0], self.sizes.action)
-        features, actions, entropies = [state.feature], [action], []
+        seen, actions, entropies = [short(state.feature)], [action], []
         for _ in range(horizon):
-            policy = actor(features[-1].detach(), skill)
+            policy = actor(seen[-1].detach(), skill)
             action = policy.sample()
             state = self.rssm.prior_step(state, action)
-            features.append(state.feature)
+            seen.append(th.cat([state.stoch, short(state.deter)], -1))
             actions.append(action)
             entropies.append(policy.entropy())
-        return Imagination(th.stack(features), th.stack(actions), th.stack(entropies), skill)
+        return Imagination(th.stack(seen), th.stack(actions), th.stack(entropies), skill)
 
     def discount(self, feature: th.Tensor, goes_on: th.Tensor | None = None) -> th.Tensor:
         """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…).
