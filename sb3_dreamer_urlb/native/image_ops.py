@@ -1,7 +1,7 @@
 """Convolutions on a processor's tiles (AMX) as torch operators: products with an image's windows, which never are in memory.
 
-Images are (N, C, height, width), channels last in memory. :mod:`sb3_dreamer_urlb.world_model.convolution` says what the three passes
-are, :mod:`sb3_dreamer_urlb.native.product_ops` has the formats.
+Images are (N, C, height, width), channels last in memory. The three passes are those of
+:mod:`sb3_dreamer_urlb.world_model.convolution`, the formats those of :mod:`sb3_dreamer_urlb.native.product_ops`.
 """
 
 from __future__ import annotations

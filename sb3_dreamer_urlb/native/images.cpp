@@ -11,11 +11,21 @@ static inline Index most(Index a, Index b) { return a > b ? a : b; }
 
 // What follows `count` numbers at `out` up to a step is overwritten with zeros.
 static inline void copy(const BF16* x, Index count, BF16* out) {
-    for (Index i = 0; i < count; i += DEPTH) _mm512_storeu_si512(out + i, _mm512_maskz_loadu_epi16(first(count - i), x + i));
+    for (; count >= DEPTH; count -= DEPTH, x += DEPTH, out += DEPTH) _mm512_storeu_si512(out, _mm512_loadu_si512(x));
+    if (count > 0) _mm512_storeu_si512(out, _mm512_maskz_loadu_epi16(first(count), x));
 }
 static inline void copy(const float* x, Index count, float* out) {
-    for (Index i = 0; i < count; i += LANES)
-        _mm512_storeu_ps(out + i, _mm512_maskz_loadu_ps(first(least(count - i, LANES)), x + i));
+    for (; count >= LANES; count -= LANES, x += LANES, out += LANES) _mm512_storeu_ps(out, _mm512_loadu_ps(x));
+    if (count > 0) _mm512_storeu_ps(out, _mm512_maskz_loadu_ps(first(count), x));
+}
+
+static inline void copy_exactly(const BF16* x, Index count, BF16* out) {
+    for (; count >= DEPTH; count -= DEPTH, x += DEPTH, out += DEPTH) _mm512_storeu_si512(out, _mm512_loadu_si512(x));
+    if (count > 0) _mm512_mask_storeu_epi16(out, first(count), _mm512_maskz_loadu_epi16(first(count), x));
+}
+static inline void copy_exactly(const float* x, Index count, float* out) {
+    for (; count >= LANES; count -= LANES, x += LANES, out += LANES) _mm512_storeu_ps(out, _mm512_loadu_ps(x));
+    if (count > 0) _mm512_mask_storeu_ps(out, first(count), _mm512_maskz_loadu_ps(first(count), x));
 }
 
 // One window for each pixel of a grid, from `stride` pixels apart; outside of the image there are zeros.
@@ -27,16 +37,44 @@ struct Windows {
 
     Index depth() const { return kernel_height * kernel_width * channels; }
 
-    // Numbers of window r from `begin` on. May overwrite a step behind them with zeros.
-    void read(Index r, Index begin, Index count, T* out) const {
-        const Index x = r % grid_width * stride - left, line = r / grid_width % grid_height * stride - top, run = kernel_width * channels;
-        const T* lines = image + (r / grid_width / grid_height * height * width + x) * channels;
-        for (Index row = begin / run, at = begin % run; count > 0; row++, at = 0) {
-            const Index length = least(run - at, count), y = line + row;
+    bool inside(Index x, Index y) const {
+        return x >= 0 && x + kernel_width <= width && y >= 0 && y + kernel_height <= height;
+    }
+
+    // Numbers from `begin` to `end` of the windows from r on, to lines `apart` numbers apart. May overwrite a step behind them
+    // with zeros.
+    void read(Index r, Index count, Index begin, Index end, T* out, Index apart) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        const Index run = kernel_width * channels, row = begin / run, at = begin - row * run;
+        for (; count > 0; count--, out += apart) {
+            const Index left_of = x * stride - left, line = y * stride - top;
+            if (inside(left_of, line))
+                read_inside(image + ((i * height + line + row) * width + left_of) * channels + at, run, at, end - begin, out);
+            else
+                read_border(i, line + row, left_of, run, at, end - begin, out);
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
+        }
+    }
+
+    void read_inside(const T* from, Index run, Index at, Index count, T* out) const {
+        for (Index length = least(run - at, count); count > 0; length = least(run, count)) {
+            copy(from, length, out);
+            from += width * channels - at;
+            at = 0;
+            out += length, count -= length;
+        }
+    }
+
+    void read_border(Index i, Index y, Index x, Index run, Index at, Index count, T* out) const {
+        for (; count > 0; y++, at = 0) {
+            const Index length = least(run - at, count);
             if (y < 0 || y >= height) {
                 std::memset((void*)out, 0, length * sizeof(T));
             } else {
-                const T* from = lines + y * width * channels + at;
+                const T* from = image + ((i * height + y) * width + x) * channels + at;
                 const Index before = least(most(-x * channels - at, 0), length);
                 const Index inside = least(most((width - x) * channels - at, before), length);
                 if (before) std::memset((void*)out, 0, before * sizeof(T));
@@ -53,7 +91,7 @@ struct Windows {
         const Index steps = steps_of(count), across = up_to(columns, DEPTH) + DEPTH;
         for (Index s = 0; s < steps; s++) {
             const Index some = least(count - s * DEPTH, DEPTH);
-            for (Index i = 0; i < some; i++) read(r + s * DEPTH + i, c, columns, rows + i * across);
+            read(r + s * DEPTH, some, c, c + columns, rows, across);
             for (Index a = 0; a < columns; a += PANEL)
                 lay_tiles_by_depth<RIGHT>(rows + a, across, columns - a, some, tile_of<T>(out, a, s, steps));
         }
@@ -66,12 +104,19 @@ struct Pixels {
     T* image;
     Index height, width, channels, stride, grid_height, grid_width;
 
-    void write(Index r, const T* result) const {
-        const Index x = r % grid_width * stride, y = r / grid_width % grid_height * stride, i = r / grid_width / grid_height;
-        const Index run = stride * channels, inside = least(width - x, stride) * channels;
-        T* to = image + ((i * height + y) * width + x) * channels;
-        for (Index row = 0; row < least(height - y, stride); row++, to += width * channels, result += run)
-            std::memcpy((void*)to, result, inside * sizeof(T));
+    void write(Index r, Index count, const T* results) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        const Index run = stride * channels;
+        for (; count > 0; count--) {
+            T* to = image + ((i * height + y * stride) * width + x * stride) * channels;
+            const Index length = least(width - x * stride, stride) * channels, rows = least(height - y * stride, stride);
+            for (Index row = 0; row < rows; row++) copy_exactly(results + row * run, length, to + row * width * channels);
+            results += stride * run;
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
+        }
     }
 };
 
@@ -79,10 +124,10 @@ constexpr Index BLOCK = 384 * 1024;  // numbers of windows laid out at a time: h
 
 // Windows as the left operand, bfloat16 row after row, float32 as parts on tiles.
 static inline void lay_out_windows(const Windows<BF16>& windows, Index r, Index count, Index stride, BF16*, uint16_t* out) {
-    for (Index i = 0; i < count; i++) windows.read(r + i, 0, windows.depth(), (BF16*)out + i * stride);
+    windows.read(r, count, 0, windows.depth(), (BF16*)out, stride);
 }
 static inline void lay_out_windows(const Windows<float>& windows, Index r, Index count, Index stride, float* rows, uint16_t* out) {
-    for (Index i = 0; i < count; i++) windows.read(r + i, 0, windows.depth(), rows + i * stride);
+    windows.read(r, count, 0, windows.depth(), rows, stride);
     lay_out_left(rows, stride, count, windows.depth(), out);
 }
 static inline Left laid_out(const uint16_t* windows, Index stride, BF16*) { return Left((const BF16*)windows, stride); }
@@ -133,8 +178,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                 store_sums(sums[turn % 2]);
             }
             write(panels * all - 1, 0, PANEL);
-            if (pixels)
-                for (Index i = 0; i < count; i++) pixels->write(r + i, results + i * outputs);
+            if (pixels) pixels->write(r, count, results);
         }
     }
 }
