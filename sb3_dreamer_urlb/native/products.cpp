@@ -5,8 +5,8 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include "activation.h"
-#include "tiles.h"
+#include "behind.h"
+#include "transposed.h"
 
 #ifdef HAS_TILES
 
@@ -30,44 +30,6 @@ static void lay_out_weights(const T* weight, Index stride, Index outputs, Index 
             lay_out_right(weight + p * PANEL * stride, stride, some, depth, out + p * panel);
     }
 }
-
-// What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
-template <class Out>
-struct Behind {
-    const float* bias;
-    const Out* plus;
-    Index plus_stride;
-    bool elu;
-    Out* out;
-    Index out_stride;
-
-    // sums: four tiles, of 32 rows and 32 columns of the result; the rows from begin to end and the first columns.
-    void operator()(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
-        if (columns < PANEL)
-            write<true>(sums, r, c, begin, end, columns);
-        else
-            write<false>(sums, r, c, begin, end, columns);
-    }
-
-    template <bool some>
-    void write(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
-        const Out *its_plus = plus ? plus + r * plus_stride + c : nullptr;
-        Out* its_out = out + (r + begin) * out_stride + c;
-        const bool its_elu = elu;
-        const __mmask32 mask = first(columns);
-        const Two b = !bias ? Two{} : load_two<some>(bias + c, mask);
-        for (Index i = begin; i < end; i++, its_out += out_stride) {
-            const float* sum = sums + (i / TILE * 2 * TILE + i % TILE) * TILE;
-            Two y = {load(sum) + b.low, load(sum + TILE * TILE) + b.high};
-            if (its_plus) {
-                Two p = load_two<some>(its_plus + i * plus_stride, mask);
-                y = {y.low + p.low, y.high + p.high};
-            }
-            if (its_elu) y = {::elu(y.low), ::elu(y.high)};
-            store_two<some>(its_out, y, mask);
-        }
-    }
-};
 
 // Whole rows that begin with a line of the cache can be read as they are. What stands behind them, up to a step, meets weights
 // of 0; it belongs to the same memory, because the next row begins with a line, too.
@@ -111,66 +73,6 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
 
 // -- the gradient of weights ------------------------------------------------------------------------------------------
 
-constexpr Index ROWS = 320, COLUMNS = 512;  // laid out at a time: together with their sums, what a core's cache holds
-
-template <class T>
-static void add_transposed_product(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, Index rows,
-                                   Index m, Index n) {
-    static thread_local Scratch scratch;
-    const Index size = least(up_to(rows, DEPTH), ROWS), wide = least(n, COLUMNS);
-    uint16_t* laid_left = (uint16_t*)scratch.get((laid_size<T>(m, size) + laid_size<T>(wide, size)) * sizeof(uint16_t));
-    uint16_t* laid_right = laid_left + laid_size<T>(m, size);
-    Tiles tiles;
-    for (Index c = 0; c < n; c += COLUMNS) {
-        const Index columns = least(n - c, COLUMNS);
-        for (Index r = 0; r < rows; r += size) {
-            const Index count = least(rows - r, size), panel = steps_of(count) * 2 * PARTS<T> * NUMBERS;
-            lay_out_by_depth<LEFT>(left + r * left_stride, left_stride, m, count, laid_left);
-            lay_out_by_depth<RIGHT>(right + r * right_stride + c, right_stride, columns, count, laid_right);
-            float* sum = sums + up_to(m, PANEL) * c;
-            for (Index i = 0; i < m; i += PANEL) {
-                for (Index j = 0; j < columns; j += PANEL, sum += PANEL * PANEL) {
-                    for (Index k = 0; k < PANEL * PANEL; k += TILE) __builtin_prefetch(sum + PANEL * PANEL + k, 1);
-                    if (r > 0)
-                        load_sums(sum);
-                    else
-                        zero_sums();
-                    add_steps<PARTS<T>>(Left(laid_left + i / PANEL * panel, PARTS<T>), laid_right + j / PANEL * panel, steps_of(count),
-                                        j / PANEL % 2, [](Index) {});
-                    store_sums(sum);
-                }
-            }
-        }
-    }
-}
-
-// sums: room for threads · up_to(m, 32) · up_to(n, 32).
-template <class T>
-static void transposed_product(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, float* out,
-                               Index rows, Index m, Index n, int threads) {
-    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
-#pragma omp parallel num_threads(threads)
-    {
-        const Index share = up_to((rows + omp_get_num_threads() - 1) / omp_get_num_threads(), DEPTH);
-        const Index me = omp_get_thread_num(), us = (rows + share - 1) / share, begin = share * me, count = least(rows - begin, share);
-        if (count > 0)
-            add_transposed_product(left + begin * left_stride, left_stride, right + begin * right_stride, right_stride,
-                                   sums + me * size, count, m, n);
-#pragma omp barrier
-#pragma omp for schedule(static)
-        for (Index i = 0; i < m; i++) {
-            for (Index j = 0; j < n; j++) {
-                const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
-                const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
-                const Index at = block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE + j % TILE;
-                float total = 0;
-                for (Index t = 0; t < us; t++) total += sums[t * size + at];
-                out[i * n + j] = total;
-            }
-        }
-    }
-}
-
 #define FOR(T, NAME)                                                                                                   \
     EXPORT Index laid_size_##NAME(Index across, Index depth) { return laid_size<T>(across, depth); }                   \
     EXPORT void lay_out_weights_##NAME(const T* weight, Index stride, Index outputs, Index depth, int by_depth, uint16_t* out, \
@@ -179,7 +81,7 @@ static void transposed_product(const T* left, Index left_stride, const T* right,
     }                                                                                                                  \
     EXPORT void transposed_product_##NAME(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, \
                                           float* out, Index rows, Index m, Index n, int threads) {                     \
-        transposed_product(left, left_stride, right, right_stride, sums, out, rows, m, n, threads);                    \
+        transposed_product(left, left_stride, PlainRows<T>{right, right_stride}, sums, out, rows, m, n, threads);       \
     }
 FOR(float, float)
 FOR(BF16, bfloat16)

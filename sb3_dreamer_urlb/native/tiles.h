@@ -243,6 +243,19 @@ static inline void add_step(const Left& a, Index at, const uint16_t* b) {
     }
 }
 
+// The same for the right operand's first 16 columns alone: sums 0 and 2.
+template <int parts>
+static inline void add_half_step(const Left& a, Index at, const uint16_t* b) {
+    for (int left = 0; left < parts; left++) {
+        LOAD_LEFT(left);
+        for (int right = 0; right < parts - left; right++) {
+            _tile_loadd(6, b + 2 * right * NUMBERS, 64);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_dpbf16ps(2, 5, 6);
+        }
+    }
+}
+
 // All steps. Who goes backwards every other time finds what was read last in the nearest cache. Between the steps goes on
 // what else there is to do: tiles are multiplied beside it.
 template <int parts, class Meanwhile>
@@ -250,6 +263,15 @@ static inline void add_steps(const Left& a, const uint16_t* b, Index steps, bool
     for (Index i = 0; i < steps; i++) {
         const Index s = backwards ? steps - 1 - i : i;
         add_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+        meanwhile(i);
+    }
+}
+
+template <int parts, class Meanwhile>
+static inline void add_half_steps(const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
+    for (Index i = 0; i < steps; i++) {
+        const Index s = backwards ? steps - 1 - i : i;
+        add_half_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
         meanwhile(i);
     }
 }

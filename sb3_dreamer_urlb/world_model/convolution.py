@@ -1,5 +1,8 @@
 """Strided convolutions on CPUs, in the forms that are fast there; elsewhere the layers as they are.
 
+With kernels of our own (native/) all passes are products with windows that are laid out in the cache, ELU comes with the
+product, and its gradient with the bias's. What follows is for the other machines.
+
 A convolution and a transposed one with the same kernel are the same three passes between a *wide* image and a *narrow*
 one, whose every pixel belongs to one kernel-sized patch of the wide image:
 
@@ -21,9 +24,12 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 from torch.autograd import Function
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import FunctionCtx, once_differentiable
 
+from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.dense import column_sums
+from sb3_dreamer_urlb.native import image_ops, ops
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
@@ -41,7 +47,9 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     """
     if x.device.type != "cpu" or not th.is_grad_enabled():
         return layer(x)
-    dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
+    dtype = _dtype(x)
+    if _on_tiles(layer, x):
+        return _tiles(layer, x, False)
     form = _form(layer, x, dtype)
     if form is None:
         return layer(x)
@@ -51,6 +59,34 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     with th.autocast("cpu", enabled=False):
         transposed = isinstance(layer, nn.ConvTranspose2d)
         return _Convolution.apply(x.to(dtype), weight, bias, form, transposed)  # type: ignore[no-untyped-call]
+
+
+def convolve_elu(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
+    """ELU behind :func:`convolve`, whose parameters it takes."""
+    if x.device.type == "cpu" and th.is_grad_enabled() and _on_tiles(layer, x):
+        return _tiles(layer, x, True)
+    return elu_(convolve(layer, x))
+
+
+def _dtype(x: th.Tensor) -> th.dtype:
+    """The format of a convolution of x."""
+    return th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
+
+
+def _on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> bool:
+    if not native.active() or _dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
+        return False
+    narrow = x.shape[-2:]
+    if isinstance(layer, nn.Conv2d):
+        narrow = th.Size((size - k) // layer.stride[0] + 1 for size, k in zip(narrow, layer.kernel_size, strict=True))
+    return image_ops.worthwhile(len(x) * narrow.numel())
+
+
+def _tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, elu: bool) -> th.Tensor:
+    # Outside of the function, so that autograd brings x's gradient back.
+    x, transposed = x.to(_dtype(x)), isinstance(layer, nn.ConvTranspose2d)
+    y: th.Tensor = _OnTiles.apply(x, layer.weight, layer.bias, layer.stride[0], transposed, elu)  # type: ignore[no-untyped-call]
+    return y
 
 
 def _form(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, dtype: th.dtype) -> Form | None:
@@ -68,13 +104,50 @@ def _form(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, dtype: th.dtype) 
     return Phases(kernel, stride) if kernel % stride == 0 else Direct(kernel, stride)
 
 
+class _OnTiles(Function):
+    """An image in the format of products; weights as below, in float32 whatever the format."""
+
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: int, transposed: bool, elu: bool
+    ) -> th.Tensor:
+        x = x.contiguous(memory_format=th.channels_last)
+        if transposed:
+            size = [(side - 1) * stride + k for side, k in zip(x.shape[2:], weight.shape[2:], strict=True)]
+            y: th.Tensor = image_ops.scatter(x, weight, stride, size, bias, elu)
+        else:
+            y = image_ops.gather(x, weight, stride, bias, elu)
+        ctx.save_for_backward(x, weight, y if elu else None)  # type: ignore[arg-type]
+        ctx.stride, ctx.transposed = stride, transposed  # type: ignore[attr-defined]
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
+        x, weight, y = ctx.saved_tensors  # type: ignore[attr-defined]
+        stride, transposed = ctx.stride, ctx.transposed  # type: ignore[attr-defined]
+        wants_x, wants_weight, wants_bias, *_ = ctx.needs_input_grad  # type: ignore[attr-defined]
+        x_grad = weight_grad = bias_grad = None
+        if y is not None:
+            grad, bias_grad = ops.elu_backward(grad, y, wants_bias)
+        else:
+            grad = grad.contiguous(memory_format=th.channels_last)
+            bias_grad = column_sums(grad.permute(0, 2, 3, 1).flatten(0, 2)).float() if wants_bias else None
+        if wants_x and transposed:
+            x_grad = image_ops.gather(grad, weight, stride, None, False)
+        elif wants_x:
+            x_grad = image_ops.scatter(grad, weight, stride, x.shape[2:], None, False)
+        if wants_weight:
+            wide, narrow = (grad, x) if transposed else (x, grad)
+            weight_grad = image_ops.weight_gradient(wide, narrow, weight.shape[2:], stride)
+        return x_grad, weight_grad, bias_grad if wants_bias else None, None, None, None
+
+
 class _Convolution(Function):
     """Weight (narrow channels, wide channels, k, k), as PyTorch has it for both kinds."""
 
     @staticmethod
-    def forward(
-        ctx: th.autograd.function.FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, form: Form, transposed: bool
-    ) -> th.Tensor:
+    def forward(ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, form: Form, transposed: bool) -> th.Tensor:
         narrow = x if transposed else form.lay_out(x)
         ctx.save_for_backward(narrow, weight)
         ctx.form, ctx.transposed, ctx.side = form, transposed, x.shape[-1]  # type: ignore[attr-defined]
@@ -82,7 +155,7 @@ class _Convolution(Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: th.autograd.function.FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
+    def backward(ctx: FunctionCtx, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
         saved, weight = ctx.saved_tensors  # type: ignore[attr-defined]
         form, transposed = ctx.form, ctx.transposed  # type: ignore[attr-defined]
         wants_x, wants_weight, wants_bias, *_ = ctx.needs_input_grad  # type: ignore[attr-defined]

@@ -8,11 +8,10 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.dense import linear
+from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
-from sb3_dreamer_urlb.world_model.convolution import convolve
+from sb3_dreamer_urlb.world_model.convolution import convolve_elu
 
 
 def deconvolution_kernels(size: int) -> list[int]:
@@ -61,20 +60,20 @@ class ConvDecoder(nn.Module):
         :param feature: float (…, F)
         :return: mean image, float (…, C, height, width)
         """
-        x = elu_(self._grow(linear(feature.flatten(0, -2), self.input.weight, self.input.bias)))
+        x = self._grow(linear(feature.flatten(0, -2), self.input.weight, self.input.bias))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
-            x = elu_(convolve(deconv, x))
+            x = convolve_elu(deconv, x)
         return full(x).reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:
-        """The first transposed convolution: on a 1×1 map it is a plain matrix product, which is faster."""
+        """The first transposed convolution and its ELU: on a 1×1 map it is a plain matrix product, which is faster."""
         first = self.deconvs[0]
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
         # Channels last, as all that follow.
         weight = first.weight.permute(0, 2, 3, 1).reshape(channels, -1).T
-        return linear(x, weight, first.bias.repeat(height * width)).view(-1, height, width, out).permute(0, 3, 1, 2)
+        return linear_elu(x, weight, first.bias.repeat(height * width)).view(-1, height, width, out).permute(0, 3, 1, 2)
 
 
 class VectorDecoder(MLP):

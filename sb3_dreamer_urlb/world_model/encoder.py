@@ -10,7 +10,7 @@ from torch import nn
 from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
-from sb3_dreamer_urlb.world_model.convolution import convolve
+from sb3_dreamer_urlb.world_model.convolution import convolve, convolve_elu
 
 KERNEL, STRIDE = 4, 2
 
@@ -52,7 +52,7 @@ class ConvEncoder(Encoder):
         x = image.flatten(0, -4).contiguous(memory_format=th.channels_last)
         for conv in self.convs:
             assert isinstance(conv, nn.Conv2d)
-            x = self.activation(convolve(conv, x))
+            x = convolve_elu(conv, x) if self.activation is elu_ else self.activation(convolve(conv, x))
         return full(x).reshape(image.shape[:-3] + (self.embed_size,))
 
 

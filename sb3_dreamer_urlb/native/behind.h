@@ -1,0 +1,47 @@
+// What follows a product on tiles before its sums leave the processor.
+#pragma once
+
+#include "activation.h"
+#include "tiles.h"
+
+#ifdef HAS_TILES
+
+// What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
+template <class Out>
+struct Behind {
+    const float* bias;
+    const Out* plus;
+    Index plus_stride;
+    bool elu;
+    Out* out;
+    Index out_stride;
+
+    // sums: four tiles, of 32 rows and 32 columns of the result; the rows from begin to end and the first columns.
+    void operator()(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
+        if (columns < PANEL)
+            write<true>(sums, r, c, begin, end, columns);
+        else
+            write<false>(sums, r, c, begin, end, columns);
+    }
+
+    template <bool some>
+    void write(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
+        const Out *its_plus = plus ? plus + r * plus_stride + c : nullptr;
+        Out* its_out = out + (r + begin) * out_stride + c;
+        const bool its_elu = elu;
+        const __mmask32 mask = first(columns);
+        const Two b = !bias ? Two{} : load_two<some>(bias + c, mask);
+        for (Index i = begin; i < end; i++, its_out += out_stride) {
+            const float* sum = sums + (i / TILE * 2 * TILE + i % TILE) * TILE;
+            Two y = {load(sum) + b.low, load(sum + TILE * TILE) + b.high};
+            if (its_plus) {
+                Two p = load_two<some>(its_plus + i * plus_stride, mask);
+                y = {y.low + p.low, y.high + p.high};
+            }
+            if (its_elu) y = {::elu(y.low), ::elu(y.high)};
+            store_two<some>(its_out, y, mask);
+        }
+    }
+};
+
+#endif

@@ -1,0 +1,213 @@
+// Convolutions on tiles: products with the windows of images, which are laid out in the cache and nowhere else.
+//
+// Images are (number, height, width, channels), as torch's channels last. A window's numbers stand in `kernel` pieces, one a line.
+
+#include "behind.h"
+#include "transposed.h"
+
+#ifdef HAS_TILES
+
+static inline Index most(Index a, Index b) { return a > b ? a : b; }
+
+// What follows `count` numbers at `out` up to a step is overwritten with zeros.
+static inline void copy(const BF16* x, Index count, BF16* out) {
+    for (; count >= DEPTH; count -= DEPTH, x += DEPTH, out += DEPTH) _mm512_storeu_si512(out, _mm512_loadu_si512(x));
+    if (count > 0) _mm512_storeu_si512(out, _mm512_maskz_loadu_epi16(first(count), x));
+}
+static inline void copy(const float* x, Index count, float* out) {
+    for (; count >= LANES; count -= LANES, x += LANES, out += LANES) _mm512_storeu_ps(out, _mm512_loadu_ps(x));
+    if (count > 0) _mm512_storeu_ps(out, _mm512_maskz_loadu_ps(first(count), x));
+}
+
+static inline void copy_exactly(const BF16* x, Index count, BF16* out) {
+    for (; count >= DEPTH; count -= DEPTH, x += DEPTH, out += DEPTH) _mm512_storeu_si512(out, _mm512_loadu_si512(x));
+    if (count > 0) _mm512_mask_storeu_epi16(out, first(count), _mm512_maskz_loadu_epi16(first(count), x));
+}
+static inline void copy_exactly(const float* x, Index count, float* out) {
+    for (; count >= LANES; count -= LANES, x += LANES, out += LANES) _mm512_storeu_ps(out, _mm512_loadu_ps(x));
+    if (count > 0) _mm512_mask_storeu_ps(out, first(count), _mm512_maskz_loadu_ps(first(count), x));
+}
+
+// One window for each pixel of a grid, from `stride` pixels apart; outside of the image there are zeros.
+template <class T>
+struct Windows {
+    const T* image;
+    Index height, width, channels;
+    Index kernel_height, kernel_width, stride, grid_height, grid_width, top, left;  // top, left: lines and pixels above the image
+
+    Index depth() const { return kernel_height * kernel_width * channels; }
+
+    bool inside(Index x, Index y) const {
+        return x >= 0 && x + kernel_width <= width && y >= 0 && y + kernel_height <= height;
+    }
+
+    // Numbers from `begin` to `end` of the windows from r on, to lines `apart` numbers apart. May overwrite a step behind them
+    // with zeros.
+    void read(Index r, Index count, Index begin, Index end, T* out, Index apart) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        const Index run = kernel_width * channels, row = begin / run, at = begin - row * run;
+        for (; count > 0; count--, out += apart) {
+            const Index left_of = x * stride - left, line = y * stride - top;
+            if (inside(left_of, line))
+                read_inside(image + ((i * height + line + row) * width + left_of) * channels + at, run, at, end - begin, out);
+            else
+                read_border(i, line + row, left_of, run, at, end - begin, out);
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
+        }
+    }
+
+    void read_inside(const T* from, Index run, Index at, Index count, T* out) const {
+        for (Index length = least(run - at, count); count > 0; length = least(run, count)) {
+            copy(from, length, out);
+            from += width * channels - at;
+            at = 0;
+            out += length, count -= length;
+        }
+    }
+
+    void read_border(Index i, Index y, Index x, Index run, Index at, Index count, T* out) const {
+        for (; count > 0; y++, at = 0) {
+            const Index length = least(run - at, count);
+            if (y < 0 || y >= height) {
+                std::memset((void*)out, 0, length * sizeof(T));
+            } else {
+                const T* from = image + ((i * height + y) * width + x) * channels + at;
+                const Index before = least(most(-x * channels - at, 0), length);
+                const Index inside = least(most((width - x) * channels - at, before), length);
+                if (before) std::memset((void*)out, 0, before * sizeof(T));
+                copy(from + before, inside - before, out + before);
+                if (inside < length) std::memset((void*)(out + inside), 0, (length - inside) * sizeof(T));
+            }
+            out += length, count -= length;
+        }
+    }
+
+    // As the right operand of a transposed product.
+    static Index scratch(Index columns) { return DEPTH * (columns + 2 * DEPTH); }
+    void lay_out(Index r, Index count, Index c, Index columns, T* rows, uint16_t* out) const {
+        const Index steps = steps_of(count), across = up_to(columns, DEPTH) + DEPTH;
+        for (Index s = 0; s < steps; s++) {
+            const Index some = least(count - s * DEPTH, DEPTH);
+            read(r + s * DEPTH, some, c, c + columns, rows, across);
+            for (Index a = 0; a < columns; a += PANEL)
+                lay_tiles_by_depth<RIGHT>(rows + a, across, columns - a, some, tile_of<T>(out, a, s, steps));
+        }
+    }
+};
+
+// Results of a grid's pixels, (stride, stride, channels) each, as pixels of an image.
+template <class T>
+struct Pixels {
+    T* image;
+    Index height, width, channels, stride, grid_height, grid_width;
+
+    void write(Index r, Index count, const T* results) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        const Index run = stride * channels;
+        for (; count > 0; count--) {
+            T* to = image + ((i * height + y * stride) * width + x * stride) * channels;
+            const Index length = least(width - x * stride, stride) * channels, rows = least(height - y * stride, stride);
+            for (Index row = 0; row < rows; row++) copy_exactly(results + row * run, length, to + row * width * channels);
+            results += stride * run;
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
+        }
+    }
+};
+
+constexpr Index BLOCK = 384 * 1024;  // numbers of windows laid out at a time: half of a core's cache
+
+// Windows as the left operand, bfloat16 row after row, float32 as parts on tiles.
+static inline void lay_out_windows(const Windows<BF16>& windows, Index r, Index count, Index stride, BF16*, uint16_t* out) {
+    windows.read(r, count, 0, windows.depth(), (BF16*)out, stride);
+}
+static inline void lay_out_windows(const Windows<float>& windows, Index r, Index count, Index stride, float* rows, uint16_t* out) {
+    windows.read(r, count, 0, windows.depth(), rows, stride);
+    lay_out_left(rows, stride, count, windows.depth(), out);
+}
+static inline Left laid_out(const uint16_t* windows, Index stride, BF16*) { return Left((const BF16*)windows, stride); }
+static inline Left laid_out(const uint16_t* windows, Index, float*) { return Left(windows, PARTS<float>); }
+
+// windows · weights, one row for each pixel of the grid. To `pixels` if there are some, else to where `behind` says.
+template <class T>
+static void windows_by_weights(const Windows<T>& windows, Index rows, const uint16_t* weights, Index outputs, Behind<T> behind,
+                               const Pixels<T>* pixels, int threads) {
+    const Index steps = steps_of(windows.depth()), stride = (steps | 1) * DEPTH;  // an odd number of lines: spread over the cache
+    const Index panel = steps * 2 * PARTS<T> * NUMBERS, laid = PANEL * stride * PARTS<T>, panels = (outputs + PANEL - 1) / PANEL;
+    const Index at_once = most(least(BLOCK / laid, 8), 1), size = at_once * PANEL, blocks = (rows + size - 1) / size;
+#pragma omp parallel num_threads(least(threads, blocks))
+    {
+        static thread_local Scratch scratch;
+        const Index laid_bytes = (at_once * laid + DEPTH) * sizeof(uint16_t), row_bytes = (PANEL * stride + DEPTH) * sizeof(T);
+        char* memory = (char*)scratch.get(laid_bytes + row_bytes + size * outputs * sizeof(T));
+        std::memset(memory, 0, laid_bytes + row_bytes);
+        uint16_t* operand = (uint16_t*)memory;
+        T* lines = (T*)(memory + laid_bytes);
+        T* results = (T*)(memory + laid_bytes + row_bytes);
+        alignas(64) float sums[2][4 * TILE * TILE] = {};
+        Behind<T> its = behind;
+        if (pixels) its.out = results;
+        Tiles tiles;
+#pragma omp for schedule(static)
+        for (Index block = 0; block < blocks; block++) {
+            const Index r = block * size, count = least(rows - r, size), here = pixels ? 0 : r, all = (count + PANEL - 1) / PANEL;
+            const auto height = [&](Index b) { return least(count - b * PANEL, PANEL); };
+            for (Index b = 0; b < all; b++)
+                lay_out_windows(windows, r + b * PANEL, height(b), stride, lines, operand + b * laid);
+            const auto write = [&](Index turn, Index begin, Index end) {
+                const Index p = turn / all, b = turn % all;
+                its(sums[turn % 2], here + b * PANEL, p * PANEL, begin, least(end, height(b)), least(outputs - p * PANEL, PANEL));
+            };
+            const Index share = (PANEL + steps - 1) / steps;
+            for (Index turn = 0; turn < panels * all; turn++) {
+                const Index p = turn / all, b = turn % all;
+                const Left left = laid_out(operand + b * laid, stride, (T*)nullptr);
+                const auto meanwhile = [&](Index i) {
+                    if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
+                };
+                zero_sums();
+                if (outputs - p * PANEL <= TILE)
+                    add_half_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
+                else
+                    add_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
+                store_sums(sums[turn % 2]);
+            }
+            write(panels * all - 1, 0, PANEL);
+            if (pixels) pixels->write(r, count, results);
+        }
+    }
+}
+
+// shape: number, height, width and channels of images, height and width of kernels, stride, height and width of the grid, lines
+// above and pixels left of an image, and the stride of pixels to write to, 0 if there are none.
+template <class T>
+static Windows<T> windows_of(const Index* shape, const T* image) {
+    return {image, shape[1], shape[2], shape[3], shape[4], shape[5], shape[6], shape[7], shape[8], shape[9], shape[10]};
+}
+
+#define FOR(T, NAME)                                                                                                   \
+    EXPORT void windows_by_weights_##NAME(const Index* shape, const T* image, const uint16_t* weights, Index outputs,  \
+                                          const float* bias, int elu, T* out, Index out_height, Index out_width, int threads) { \
+        const Windows<T> windows = windows_of(shape, image);                                                           \
+        const Index grid = windows.grid_height * windows.grid_width;                                                   \
+        const Behind<T> behind{bias, nullptr, 0, (bool)elu, out, outputs};                                             \
+        const Index step = shape[11];                                                                                  \
+        const Pixels<T> pixels{out, out_height, out_width, outputs / most(step * step, 1), step, windows.grid_height, windows.grid_width}; \
+        windows_by_weights(windows, shape[0] * grid, weights, outputs, behind, step ? &pixels : nullptr, threads);     \
+    }                                                                                                                  \
+    EXPORT void transposed_by_windows_##NAME(const Index* shape, const T* image, const T* left, Index m, float* sums, float* out, \
+                                             int threads) {                                                            \
+        const Windows<T> windows = windows_of(shape, image);                                                           \
+        const Index rows = shape[0] * windows.grid_height * windows.grid_width;                                        \
+        transposed_product(left, m, windows, sums, out, rows, m, windows.depth(), threads);                            \
+    }
+
+FOR(float, float)
+FOR(BF16, bfloat16)
+
+#endif

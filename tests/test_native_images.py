@@ -1,0 +1,144 @@
+"""Convolutions, images and their loss by kernels of our own are torch's within roundings."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch as th
+import torch.nn.functional as F
+from test_native import ROUNDING, kernels, threads  # noqa: F401 (fixtures)
+from test_speed import Calls
+from torch import nn
+
+from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.native import image_ops, ops, product_ops
+from sb3_dreamer_urlb.world_model import convolution
+
+#: channels and size of the wide image, channels of the narrow one, kernel, stride, images
+SHAPES = [
+    (3, (9, 9), 5, (4, 4), 2, 30),
+    (3, (64, 64), 48, (4, 4), 2, 2),
+    (48, (31, 31), 96, (4, 4), 2, 2),  # a last line and a last pixel unseen
+    (96, (13, 13), 192, (5, 5), 2, 12),  # a kernel that is no multiple of the stride
+    (3, (30, 17), 20, (6, 3), 2, 3),
+    (7, (8, 9), 33, (2, 3), 3, 40),  # pixels that no window sees
+    (40, (6, 6), 70, (4, 4), 2, 65),
+    (2, (4, 9), 3, (1, 4), 2, 50),
+    (16, (12, 12), 8, (5, 5), 1, 5),
+]
+
+
+@pytest.fixture
+def tiles(kernels):  # noqa: F811
+    with native.using("native", "cpu"):
+        if not product_ops.worthwhile(10**6, 32, 32):
+            pytest.skip("this processor has no tiles")
+        yield
+
+
+def _near(found, exact, dtype, scale=2.0):
+    assert found.shape == exact.shape and (found.double() - exact).abs().max() <= scale * ROUNDING[dtype] * exact.abs().max()
+
+
+def _image(*shape, dtype, seed=0):
+    x = th.randn(shape, generator=th.Generator().manual_seed(seed))
+    return x.to(dtype).contiguous(memory_format=th.channels_last)
+
+
+@pytest.mark.parametrize("dtype", ROUNDING)
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_passes_of_a_convolution(tiles, threads, shape, dtype):  # noqa: F811
+    channels, size, n, kernel, stride, images = shape
+    wide, bias = _image(images, channels, *size, dtype=dtype), th.randn(n)
+    weight = _image(n, channels, *kernel, dtype=dtype, seed=1).contiguous()
+    exact = F.conv2d(wide.double(), weight.double(), bias.double(), stride)
+    _near(image_ops.gather(wide, weight, stride, bias, False), exact, dtype, 8)
+    _near(image_ops.gather(wide, weight, stride, bias, True), F.elu(exact), dtype, 8)
+    narrow, bias = _image(*exact.shape, dtype=dtype, seed=2), th.randn(channels)
+    its = weight.double().requires_grad_()
+    (slope,) = th.autograd.grad(F.conv2d(wide.double(), its, None, stride), its, narrow.double())
+    found = image_ops.weight_gradient(wide, narrow, kernel, stride)
+    assert found.dtype == th.float32
+    _near(found, slope, th.float32, 10)
+    exact = F.conv_transpose2d(narrow.double(), weight.double(), None, stride)
+    seen = exact.shape[2:]
+    _near(image_ops.scatter(narrow, weight, stride, seen, bias, True), F.elu(exact + bias.view(-1, 1, 1)), dtype, 8)
+    exact = F.pad(exact, (0, size[1] - seen[1], 0, size[0] - seen[0]))
+    found = image_ops.scatter(narrow, weight, stride, size, None, False)
+    assert found.dtype == dtype and found.is_contiguous(memory_format=th.channels_last)
+    _near(found, exact, dtype, 8)
+
+
+@pytest.mark.parametrize("dtype", ROUNDING)
+@pytest.mark.parametrize("elu", [False, True])
+@pytest.mark.parametrize("kind", [nn.Conv2d, nn.ConvTranspose2d])
+@pytest.mark.parametrize(("kernel", "size"), [(4, (14, 14)), (5, (7, 7)), ((3, 2), (9, 6))], ids=str)
+def test_layers_on_tiles(tiles, seeded, kind, kernel, size, elu, dtype):
+    ours = kind(6, 10, kernel, 2)
+    theirs = copy.deepcopy(ours)
+    x = th.randn(80, 6, *size)
+    slope = found = None
+    results = []
+    for layer, compile in ((ours, "native"), (theirs, "eager")):
+        leaf = x.clone().requires_grad_()
+        with native.using(compile, "cpu"), th.autocast("cpu", enabled=dtype == th.bfloat16), Calls() as calls:
+            y = (convolution.convolve_elu if elu else convolution.convolve)(layer, leaf)
+            slope = th.randn_like(y) if slope is None else slope
+            found = th.autograd.grad(y, [leaf, *layer.parameters()], slope)
+        its = {name for name in calls.counts if name.startswith("sb3_dreamer_urlb.image")}
+        assert len(its) == (3 if compile == "native" else 0)
+        assert y.dtype == dtype and all(grad.dtype == th.float32 for grad in found)
+        results.append((y, *found))
+    for a, b in zip(*results, strict=True):
+        assert a.shape == b.shape and (a - b).abs().max() <= 16 * ROUNDING[dtype] * b.abs().max()
+
+
+def test_only_what_is_asked_for(tiles, seeded):
+    """A first convolution needs no gradient of its input; frozen ones none of their weights."""
+    layer, x = nn.Conv2d(3, 8, 4, 2), th.randn(20, 3, 14, 14)
+    with Calls() as calls:
+        convolution.convolve_elu(layer, x).sum().backward()
+    assert calls.counts["sb3_dreamer_urlb.image_scatter.default"] == 0 and layer.weight.grad is not None
+    layer.requires_grad_(False)
+    with Calls() as calls:
+        convolution.convolve_elu(layer, x.requires_grad_()).sum().backward()
+    assert calls.counts["sb3_dreamer_urlb.image_weight.default"] == 0 and x.grad is not None
+
+
+@pytest.mark.parametrize(
+    ("layer", "x"),
+    [
+        (nn.Conv2d(3, 5, 4, (2, 1)), th.randn(20, 3, 16, 16)),  # stride
+        (nn.Conv2d(3, 5, 4, 2), th.randn(2, 3, 16, 16)),  # few pixels
+        (nn.Conv2d(3, 5, 4, 2).double(), th.randn(20, 3, 16, 16).double()),
+    ],
+)
+def test_others_stay_with_torch(tiles, layer, x):
+    with Calls() as calls:
+        y = convolution.convolve_elu(layer, x)
+    assert not any(name.startswith("sb3_dreamer_urlb.image") for name in calls.counts)
+    assert th.allclose(y, F.elu(layer(x)), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda x, w: image_ops.gather(x.contiguous(), w, 2, None, False), "4 channels, last in memory"),
+        (lambda x, w: image_ops.gather(x, w[:, :3], 2, None, False), "3 channels, last in memory"),
+        (lambda x, w: image_ops.gather(x, w, 2, th.randn(4), False), "a bias for 5 outputs cannot be"),
+        (lambda x, w: image_ops.scatter(x, w, 2, (20, 20), None, False), "5 channels, last in memory"),
+        (lambda x, w: image_ops.weight_gradient(x, x, (4, 4), 2), r"windows \(4, 4\) of .* do not belong to"),
+    ],
+)
+def test_what_they_do_not_take(tiles, call, words):
+    with pytest.raises(ValueError, match=words):
+        call(_image(2, 4, 9, 9, dtype=th.float32), th.randn(5, 4, 4, 4))
+
+
+def test_no_images(tiles):
+    assert image_ops.gather(_image(0, 4, 9, 9, dtype=th.float32), th.randn(5, 4, 4, 4), 2, None, False).shape == (0, 5, 3, 3)
+    narrow = _image(0, 5, 3, 3, dtype=th.float32)
+    assert image_ops.scatter(narrow, th.randn(5, 4, 4, 4), 2, (8, 8), None, False).shape == (0, 4, 8, 8)
+    assert not image_ops.weight_gradient(_image(0, 4, 9, 9, dtype=th.float32), narrow, (4, 4), 2).any()
+    assert ops.FORMATS
