@@ -1,9 +1,6 @@
 // ELU in place behind a product without its bias, and its gradient together with that of the bias.
 
-#include "vectors.h"
-
-// What is not a number passes as it is: exp below keeps only those that arithmetic makes.
-static inline Floats elu(Floats x) { return x <= 0.0f ? exp(x) - 1.0f : x; }
+#include "lanes.h"
 
 // x ← ELU(x + bias), x (rows, columns); no bias: null.
 template <class T>
