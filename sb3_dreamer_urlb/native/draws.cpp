@@ -98,7 +98,7 @@ template <class T>
 }
 #endif
 
-template <int VECTORS, bool BIAS, bool PROBS, class T>
+template <int VECTORS, class T>
 static void draws(const T* logits, const float* bias, const float* uniform, Index* classes, float* probs, Index rows, Index variables,
                   Index size, Index step, int threads) {
     const Index vectors = VECTORS ? VECTORS : (size + LANES - 1) / LANES;
@@ -110,8 +110,8 @@ static void draws(const T* logits, const float* bias, const float* uniform, Inde
             for (Index v = 0; v < variables; v++) {
                 const Index place = r * variables + v;
                 const T* its = logits + place * size;
-                const float* its_bias = BIAS ? bias + v * size : nullptr;
-                float* its_probs = PROBS ? probs + place * size : nullptr;
+                const float* its_bias = bias ? bias + v * size : nullptr;
+                float* its_probs = probs ? probs + place * size : nullptr;
 #ifdef __AVX512DQ__
                 if constexpr (VECTORS == 2) {
                     const Index drawn = draw_of_pairs(its, its_bias, uniform[place], its_probs);
@@ -129,14 +129,6 @@ static void draws(const T* logits, const float* bias, const float* uniform, Inde
             }
         }
     }
-}
-
-template <int VECTORS, class T>
-static void draws(const T* logits, const float* bias, const float* uniform, Index* classes, float* probs, Index rows, Index variables,
-                  Index size, Index step, int threads) {
-    auto its = bias ? probs ? draws<VECTORS, true, true, T> : draws<VECTORS, true, false, T>
-                    : probs ? draws<VECTORS, false, true, T> : draws<VECTORS, false, false, T>;
-    its(logits, bias, uniform, classes, probs, rows, variables, size, step, threads);
 }
 
 // logits (rows, variables, size), bias (variables, size) or null, uniform (rows, variables) in [0, 1) → classes (rows, variables),
