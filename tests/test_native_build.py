@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -109,7 +110,7 @@ def test_what_the_linker_refuses_is_built_anew(compiler, cache):
     assert build.load().answer() == 42
 
 
-def test_whatever_changes_the_code_changes_the_name(compiler, cache, source, monkeypatch):
+def test_whatever_changes_the_code_changes_the_name(compiler, cache, source, program, monkeypatch):
     build.load()
     source.write_text(SOURCE.replace("42", "43"))
     assert build.load().answer() == 43
@@ -117,10 +118,12 @@ def test_whatever_changes_the_code_changes_the_name(compiler, cache, source, mon
     build.load()
     monkeypatch.setattr(build, "FLAGS", (*build.FLAGS, "-DFLAG"))
     build.load()
-    # Other instruction sets, as on another machine.
     monkeypatch.setenv("CXX", f"{compiler[0]} -DMACRO")
     build.load()
-    assert len(list(cache.iterdir())) == 5
+    # A compiler that predefines something else, as on another processor.
+    program(f'exec {shlex.join(compiler)} -DOTHER "$@"')
+    build.load()
+    assert len(list(cache.iterdir())) == 6
 
 
 def test_processes_at_the_same_time(compiler, cache, source):
@@ -230,13 +233,19 @@ def test_a_program_that_cannot_run(program, tmp_path):
         build.load()
 
 
-def test_a_compiler_that_hangs(program, monkeypatch):
+def test_a_compiler_that_hangs(program, monkeypatch, tmp_path):
     """It ends, and so does what it has started."""
-    program("sleep 60 & sleep 60")
-    monkeypatch.setattr(build, "TIME_LIMIT", 0.2)
-    begin = time.monotonic()
-    with pytest.raises(build.NativeUnavailable, match=r"took more than 0.2 s"):
+    os.mkfifo(tmp_path / "alive")
+    program(f"(exec > {tmp_path / 'alive'}; sleep 60) & sleep 60")
+    monkeypatch.setattr(build, "TIME_LIMIT", 0.3)
+    # Its other end closes when the last one that holds it has died.
+    pipe = os.open(tmp_path / "alive", os.O_RDONLY | os.O_NONBLOCK)
+    with pytest.raises(build.NativeUnavailable, match=r"took more than 0.3 s"):
         build.load()
+    os.set_blocking(pipe, True)
+    begin = time.monotonic()
+    assert os.read(pipe, 1) == b""
+    os.close(pipe)
     assert time.monotonic() - begin < 30
 
 
