@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Sequence
 
 import torch as th
@@ -80,7 +81,10 @@ class PlannedAgent:
     def __init__(self, agent: Agent, skill: th.Tensor):
         self.agent = agent
         self.skill = skill if agent.skills is not None else None
-        self._stoch_rows = agent.world_model.rssm.stoch_rows()
+
+    @functools.cached_property
+    def _stoch_rows(self) -> th.Tensor:
+        return self.agent.world_model.rssm.stoch_rows()
 
     def step(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> LatentState:
         """Sample the next state from the prior."""

@@ -4,8 +4,6 @@
 
 #include "lanes.h"
 
-#include <utility>
-
 // float16: more digits than bfloat16, less range.
 struct Half {
     uint16_t bits;
@@ -110,27 +108,19 @@ static void lines(const Layer<T>& layer, const Index* classes, const float* x, c
     }
 }
 
-// As many lines at once as registers hold.
-constexpr Index MOST = 13;
-template <class T, class U>
-using Lines = void (*)(const Layer<T>&, const Index*, const float*, const U*, U*, Index);
-template <class T, class U, int... I>
-static Lines<T, U> some_lines(Index count, std::integer_sequence<int, I...>) {
-    static const Lines<T, U> all_counts[] = {lines<T, U, I + 1>...};
-    return all_counts[count - 1];
-}
-
 template <class T, class U>
 static void gather(const Layer<T>& layer, const Index* classes, const float* x, Index x_stride, const U* addend, U* out, Index out_stride,
                    Index n, int threads) {
-    const Index size = Line<U>::SIZE, count = (layer.width + size - 1) / size, blocks = (count + MOST - 1) / MOST;
+    const Index size = Line<U>::SIZE;
 #pragma omp parallel for num_threads(threads) schedule(static) if (n * layer.width > WORTH_A_THREAD / 16)
     for (Index r = 0; r < n; r++) {
-        for (Index b = 0; b < blocks; b++) {
-            const Index begin = count * b / blocks, end = count * (b + 1) / blocks;
-            some_lines<T, U>(end - begin, std::make_integer_sequence<int, MOST>())(
-                layer, classes + r * layer.variables, x + r * x_stride, addend ? addend + r * layer.width : nullptr,
-                out + r * out_stride, begin * size);
+        // Thirteen lines at once are what registers hold.
+        for (Index i = 0, left = (layer.width + size - 1) / size, some; left > 0; i += some, left -= some) {
+            some = left >= 13 ? 13 : left >= 7 ? 7 : left >= 4 ? 4 : left >= 2 ? 2 : 1;
+            auto its = some == 13 ? lines<T, U, 13> : some == 7 ? lines<T, U, 7> : some == 4 ? lines<T, U, 4>
+                       : some == 2 ? lines<T, U, 2> : lines<T, U, 1>;
+            its(layer, classes + r * layer.variables, x + r * x_stride, addend ? addend + r * layer.width : nullptr,
+                out + r * out_stride, i * size);
         }
     }
 }

@@ -50,15 +50,14 @@ class NativeDynamics:
     """The RSSM's prior step.
 
     :param rssm: the network
-    :param stoch_rows: its :meth:`~sb3_dreamer_urlb.world_model.rssm.RSSM.stoch_rows`
     :param dtype: of products
     """
 
-    def __init__(self, rssm: RSSM, stoch_rows: th.Tensor, dtype: th.dtype):
+    def __init__(self, rssm: RSSM, dtype: th.dtype):
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
         self.hidden_size, self.deter_size = rssm.input.out_features, rssm.deter_size
         rows_dtype = rows_format(dtype)
-        self.rows = whole_lines(stoch_rows, rows_dtype)
+        self.rows = whole_lines(rssm.input.weight[:, : rssm.stoch_size].T, rows_dtype)
         self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].T, rows_dtype)
         self.bias = whole_lines(rssm.input.bias, rows_dtype)
         self.gru, self.norm = in_order_of_use(rssm, dtype)

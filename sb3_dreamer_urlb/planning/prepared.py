@@ -36,7 +36,7 @@ class PreparedAgent(PlannedAgent):
         def head(mlp: MLP) -> Head | NativeHead:
             return its_head(mlp, variables, classes, dtype)
 
-        self._dynamics = its_dynamics(model.rssm, self._stoch_rows, dtype)
+        self._dynamics = its_dynamics(model.rssm, dtype)
         self._reward, self._value = head(model.reward), head(agent.slow_critic)
         self._discount = None if model.discount_logit is None else head(model.discount_logit)
 

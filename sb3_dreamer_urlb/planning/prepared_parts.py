@@ -95,13 +95,12 @@ class Dynamics:
     """The RSSM's prior step.
 
     :param rssm: the network
-    :param stoch_rows: its :meth:`~sb3_dreamer_urlb.world_model.rssm.RSSM.stoch_rows`
     :param dtype: of products
     """
 
-    def __init__(self, rssm: RSSM, stoch_rows: th.Tensor, dtype: th.dtype):
+    def __init__(self, rssm: RSSM, dtype: th.dtype):
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
-        self.rows = stoch_rows.to(dtype)
+        self.rows = rssm.stoch_rows().to(dtype)
         self.action = PrepackedLinear(rssm.input.weight[:, rssm.stoch_size :], rssm.input.bias, dtype)
         self.gru, self.norm = in_order_of_use(rssm, dtype)
         self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
