@@ -44,4 +44,21 @@ struct Behind {
     }
 };
 
+// 32 rows of the left operand (fewer at the end) · weights laid out. What follows one panel is done while the next is multiplied.
+template <class T, class Out>
+static inline void block_by_weights(const Left& left, const uint16_t* weights, Index steps, Index outputs, Index r, Index height,
+                                    const Behind<Out>& behind) {
+    alignas(64) float sums[2][4 * TILE * TILE];
+    const Index panels = (outputs + PANEL - 1) / PANEL, share = (height + steps - 1) / steps;
+    for (Index p = 0; p < panels; p++) {
+        const float* before = sums[(p + 1) % 2];
+        zero_sums();
+        add_steps<PARTS<T>>(left, weights + p * steps * 2 * PARTS<T> * NUMBERS, steps, p % 2, [&](Index i) {
+            if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
+        });
+        store_sums(sums[p % 2]);
+    }
+    behind(sums[(panels - 1) % 2], r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
+}
+
 #endif

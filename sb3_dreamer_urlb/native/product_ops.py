@@ -6,6 +6,8 @@ half the time that this processor's float32 arithmetic takes (docs/performance.m
 
 from __future__ import annotations
 
+import ctypes
+
 import torch as th
 
 from sb3_dreamer_urlb.native import ops
@@ -22,13 +24,20 @@ ops.OPTIONAL["has_tiles"] = {
         *(_POINTER, _INDEX, _INDEX, _INDEX, _POINTER, _INDEX),
         *(_POINTER, _POINTER, _INDEX, _INT, _POINTER, _INDEX, _INT),
     ),
+    "chain_": (_POINTER, _INDEX, _INDEX, _POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _INT),
+    "chain_short": (_POINTER, _INDEX, _INDEX, _POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _INT),
     "transposed_product_": (_POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _POINTER, _INDEX, _INDEX, _INDEX, _INT),
 }
 
 
+def available() -> bool:
+    """Whether this processor has tiles, inside ``native.using()``."""
+    return "rows_by_weights_float" in ops._functions
+
+
 def worthwhile(rows: int, inputs: int, outputs: int) -> bool:
     """Whether this processor has tiles, and a product of (rows, inputs) with (inputs, outputs) makes use of them."""
-    return rows >= ROWS and inputs >= COLUMNS and outputs >= COLUMNS and "rows_by_weights_float" in ops._functions
+    return rows >= ROWS and inputs >= COLUMNS and outputs >= COLUMNS and available()
 
 
 @ops.operator("lay_out_weights(Tensor weight, bool transposed) -> Tensor")
@@ -81,6 +90,42 @@ def rows_by_weights(
         *(None if bias is None else bias.data_ptr(), None if plus is None else plus.data_ptr(), plus_row),
         *(elu, y.data_ptr(), outputs, th.get_num_threads()),
     )
+    return y
+
+
+@ops.operator("chain(Tensor x, Tensor? plus, Tensor[] laid, Tensor[] biases, bool short) -> Tensor")
+def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: list[th.Tensor], short: bool) -> th.Tensor:
+    """Layers one after the other, with ELU behind all but the last one.
+
+    :param x: float32 or bfloat16 (n, inputs), rows contiguous
+    :param plus: added to what the first layer gives, before ELU, (n, outputs of the first layer), in x's format; None for none
+    :param laid: what :func:`lay_out_weights` gave for the weights of each layer, of x's format
+    :param biases: float32 (outputs,) of each layer
+    :param short: give the result in x's format
+    :return: (n, outputs of the last layer), float32 unless ``short``
+    """
+    function = ops._function("chain_short") if short and x.dtype == th.bfloat16 else ops._of_format("chain_", x)
+    _check_rows(x)
+    rows, depth = x.shape
+    numbers: list[int] = []
+    for weights, bias in zip(laid, biases, strict=True):
+        outputs = len(bias)
+        if weights.numel() != _up(outputs) * _up(depth) * (3 if x.dtype == th.float32 else 1):
+            raise ValueError(f"these weights were not laid out for {depth} inputs and {outputs} outputs in {x.dtype}.")
+        if bias.dtype != th.float32 or not bias.is_contiguous():
+            raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")
+        numbers += [weights.data_ptr(), bias.data_ptr(), depth, outputs]
+        depth = outputs
+    plus_row = 0
+    if plus is not None:
+        if plus.dtype != x.dtype or plus.shape != (rows, len(biases[0])) or plus.stride(1) != 1:
+            raise ValueError(f"to {rows} rows of {len(biases[0])} outputs one cannot add {ops._describe(plus)}.")
+        plus_row = plus.stride(0)
+    y = x.new_empty(rows, depth, dtype=x.dtype if short else th.float32)
+    if rows:
+        layers = (ctypes.c_int64 * len(numbers))(*numbers)
+        place = None if plus is None else plus.data_ptr()
+        function(x.data_ptr(), x.stride(0), rows, place, plus_row, layers, len(laid), y.data_ptr(), th.get_num_threads())
     return y
 
 

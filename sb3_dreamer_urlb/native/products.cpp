@@ -43,13 +43,12 @@ static inline Left as_it_is(const float* x, Index) { return Left((const uint16_t
 
 template <class T, class Out>
 static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights, Index outputs,
-                            Behind<Out> behind, int threads) {
-    const Index steps = steps_of(depth), panel = steps * 2 * PARTS<T> * NUMBERS, blocks = (rows + PANEL - 1) / PANEL;
+                            const Behind<Out>& behind, int threads) {
+    const Index steps = steps_of(depth), blocks = (rows + PANEL - 1) / PANEL;
 #pragma omp parallel num_threads(least(threads, blocks))
     {
         static thread_local Scratch scratch;
-        uint16_t* laid = (uint16_t*)scratch.get(panel * sizeof(uint16_t));
-        alignas(64) float sums[2][4 * TILE * TILE];
+        uint16_t* laid = (uint16_t*)scratch.get(laid_size<T>(PANEL, depth) * sizeof(uint16_t));
         Tiles tiles;
 #pragma omp for schedule(static)
         for (Index block = 0; block < blocks; block++) {
@@ -57,16 +56,7 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
             const bool as_is = fits(x, stride, height);
             if (!as_is) lay_out_left(x + r * stride, stride, height, depth, laid);
             const Left left = as_is ? as_it_is(x + r * stride, stride) : Left(laid, PARTS<T>);
-            const Index panels = (outputs + PANEL - 1) / PANEL, share = (height + steps - 1) / steps;
-            for (Index p = 0; p < panels; p++) {
-                const float* before = sums[(p + 1) % 2];
-                zero_sums();
-                add_steps<PARTS<T>>(left, weights + p * panel, steps, p % 2, [&](Index i) {
-                    if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
-                });
-                store_sums(sums[p % 2]);
-            }
-            behind(sums[(panels - 1) % 2], r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
+            block_by_weights<T>(left, weights, steps, outputs, r, height, behind);
         }
     }
 }

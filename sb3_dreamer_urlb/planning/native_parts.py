@@ -11,9 +11,8 @@ from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.native import planner_ops
 from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
 from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
+from sb3_dreamer_urlb.planning.chain import Chain
 from sb3_dreamer_urlb.planning.prepared_parts import SampledState, in_order_of_use
-from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
@@ -33,17 +32,15 @@ class NativeHead:
         rows_dtype = rows_format(dtype)
         self.rows = whole_lines(first.weight[:, :stoch_size].T, rows_dtype)
         self.bias = whole_lines(first.bias, rows_dtype)
-        self.rest = PrepackedLinear(first.weight[:, stoch_size:], None, dtype)
-        self.layers = [PrepackedLinear(layer.weight, layer.bias, dtype) for layer in others]
+        self.width = first.out_features
+        weights = [first.weight[:, stoch_size:], *(layer.weight for layer in others)]
+        self.layers = Chain(weights, [None, *(layer.bias for layer in others)], dtype)
 
     def __call__(self, classes: th.Tensor, rest: th.Tensor) -> th.Tensor:
         """Classes (n, S) and what else the first layer reads, (n, D) or with a skill (n, D + W) → float (n, outputs)."""
-        x = self.rest(rest)
-        planner_ops.gather(self.rows, classes, None, None, self.bias, x, True, x)
-        *hidden, out = self.layers
-        for layer in hidden:
-            x = layer(x, elu=True)
-        return full(out(x))
+        part = rest.new_empty(len(rest), self.width)
+        planner_ops.gather(self.rows, classes, None, None, self.bias, None, False, part)
+        return self.layers(rest, part)
 
 
 class NativeDynamics:
@@ -60,10 +57,11 @@ class NativeDynamics:
         self.rows = whole_lines(rssm.input.weight[:, : rssm.stoch_size].T, rows_dtype)
         self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].T, rows_dtype)
         self.bias = whole_lines(rssm.input.bias, rows_dtype)
-        self.gru, self.norm = in_order_of_use(rssm, dtype)
+        (gru_weight, gru_bias), self.norm = in_order_of_use(rssm)
+        self.gru = Chain([gru_weight], [gru_bias], dtype)
         self.epsilon = rssm.gru_norm.eps
-        self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
-        self.logits = PrepackedLinear(rssm.prior_logits.weight, rssm.prior_logits.bias, dtype)
+        hidden, logits = rssm.prior_hidden, rssm.prior_logits
+        self.logits = Chain([hidden.weight, logits.weight], [hidden.bias, logits.bias], dtype)
         self._start: LatentState | None = None
 
     def step(self, state: LatentState | SampledState, action: th.Tensor, generator: th.Generator | None) -> SampledState:
@@ -75,8 +73,8 @@ class NativeDynamics:
             before, inputs = state.classes, state.inputs
         planner_ops.gather(self.rows, before, self.action_rows, action, self.bias, addend, True, inputs[:, : self.hidden_size])
         next_inputs, short = self._inputs(inputs)
-        deter = planner_ops.recurrence(self.gru(inputs), *self.norm, self.epsilon, state.deter, short)
-        logits = self.logits(self.hidden(short, elu=True)).view(-1, *self.shape)
+        deter = planner_ops.recurrence(self.gru(inputs, short=True), *self.norm, self.epsilon, state.deter, short)
+        logits = self.logits(short, short=True).view(-1, *self.shape)
         classes = distributions.draw_classes_of_logits(logits, generator)
         return SampledState(classes, deter, short, self.stoch_size, next_inputs)
 
