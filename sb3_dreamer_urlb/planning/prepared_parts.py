@@ -147,8 +147,8 @@ class Dynamics:
 
 
 def in_order_of_use(rssm: RSSM) -> tuple[tuple[th.Tensor, th.Tensor], tuple[th.Tensor, th.Tensor]]:
-    """Weight and bias of the GRU's layer and of its norm, with the parts (reset, update, candidate); the bias of the update gate
-    is in the norm's."""
+    """Weight and bias of the GRU's layer and of its norm, in the order reset, update, candidate; the update
+    gate's own bias is in the norm's."""
 
     def ordered(parameter: th.Tensor) -> th.Tensor:
         reset, candidate, update = parameter.chunk(3)
