@@ -47,7 +47,7 @@ def active() -> bool:
 
 
 def why_not(device: th.device | str = "cpu") -> str | None:
-    """Why there are no kernels of ours, None where there are. Builds and loads them if nobody has yet, which takes a second.
+    """Why there are no kernels of ours, None where there are. Builds and loads them if nobody has yet, which takes seconds.
 
     :param device: where the networks are
     """
