@@ -52,27 +52,39 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
     }
 }
 
-// sums: room for threads · up_to(m, 32) · up_to(n, 32).
+// Row i of the product of all threads, n numbers.
+static inline void gather_row(const float* sums, Index i, Index m, Index n, Index threads, float* row) {
+    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
+    for (Index j = 0; j < n; j += TILE) {
+        const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
+        const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
+        const float* at = sums + block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE;
+        Floats total = load(at);
+        for (Index t = 1; t < threads; t++) total += load(at + t * size);
+        _mm512_mask_storeu_ps(row + j, first(least(n - j, TILE)), (__m512)total);
+    }
+}
+
+// sums: room for threads · up_to(m, 32) · up_to(n, 32). A row of the product, (places, n / places), becomes (n / places, places).
 template <class T, class Right>
 static void transposed_product(const T* left, Index left_stride, const Right& right, float* sums, float* out, Index rows, Index m,
-                               Index n, int threads) {
-    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
+                               Index n, Index places, int threads) {
+    const Index size = up_to(m, PANEL) * up_to(n, PANEL), few = n / places;
 #pragma omp parallel num_threads(threads)
     {
         const Index share = up_to((rows + omp_get_num_threads() - 1) / omp_get_num_threads(), DEPTH);
         const Index me = omp_get_thread_num(), us = (rows + share - 1) / share, begin = share * me, count = least(rows - begin, share);
         if (count > 0) add_transposed_product(left, left_stride, right, sums + me * size, begin, count, m, n);
 #pragma omp barrier
+        static thread_local Scratch scratch;
+        float* row = (float*)scratch.get(n * sizeof(float));
 #pragma omp for schedule(static)
         for (Index i = 0; i < m; i++) {
-            for (Index j = 0; j < n; j++) {
-                const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
-                const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
-                const Index at = block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE + j % TILE;
-                float total = 0;
-                for (Index t = 0; t < us; t++) total += sums[t * size + at];
-                out[i * n + j] = total;
-            }
+            float* to = out + i * n;
+            gather_row(sums, i, m, n, us, places > 1 ? row : to);
+            if (places > 1)
+                for (Index f = 0; f < few; f++)
+                    for (Index p = 0; p < places; p++) *to++ = row[p * few + f];
         }
     }
 }

@@ -11,7 +11,7 @@ from torch import nn
 from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
-from sb3_dreamer_urlb.world_model.convolution import convolve_elu
+from sb3_dreamer_urlb.world_model.convolution import convolve_elu, convolves_on_tiles
 
 
 def deconvolution_kernels(size: int) -> list[int]:
@@ -71,6 +71,9 @@ class ConvDecoder(nn.Module):
         first = self.deconvs[0]
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
+        image = x.view(-1, channels, 1, 1)
+        if convolves_on_tiles(first, image):
+            return convolve_elu(first, image)
         # Channels last, as all that follow.
         weight = first.weight.permute(0, 2, 3, 1).reshape(channels, -1).T
         return linear_elu(x, weight, first.bias.repeat(height * width)).view(-1, height, width, out).permute(0, 3, 1, 2)
