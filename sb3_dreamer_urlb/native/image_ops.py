@@ -116,7 +116,7 @@ def weight_gradient(wide: th.Tensor, narrow: th.Tensor, kernel: Sequence[int], s
 
 
 def _arranged(weight: th.Tensor, dtype: th.dtype, stride: int) -> th.Tensor:
-    """In the order of windows, (n, height · width · w); of the wide image's phases if there is a stride, see :func:`scatter`."""
+    """In the order of windows, (n, height · width · w); if there is a stride, in that of :func:`scatter`'s phases."""
     n, channels, height, width = weight.shape
     if weight.dtype != th.float32 or not weight.is_contiguous():
         weight = weight.float().contiguous()

@@ -8,6 +8,7 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
@@ -58,13 +59,15 @@ class ConvDecoder(nn.Module):
     def forward(self, feature: th.Tensor) -> th.Tensor:
         """
         :param feature: float (…, F)
-        :return: mean image, float (…, C, height, width)
+        :return: mean image, float (…, C, height, width); what kernels of our own learn from may be bfloat16
         """
         x = self._grow(linear(feature.flatten(0, -2), self.input.weight, self.input.bias))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
             x = convolve_elu(deconv, x)
-        return full(x).reshape(feature.shape[:-1] + x.shape[1:])
+        # The loss takes the short format as it is.
+        x = x if native.active() and th.is_grad_enabled() else full(x)
+        return x.reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:
         """The first transposed convolution and its ELU: on a 1×1 map it is a plain matrix product, which is faster."""
