@@ -95,16 +95,29 @@ struct Windows {
         }
     }
 
-    // As the right operand of a transposed product.
-    static Index scratch(Index columns) { return DEPTH * (columns + 2 * DEPTH); }
-    void lay_out(Index r, Index count, Index c, Index columns, T* rows, uint16_t* out) const {
-        const Index steps = steps_of(count), across = up_to(columns, DEPTH) + DEPTH;
-        for (Index s = 0; s < steps; s++) {
-            const Index some = least(count - s * DEPTH, DEPTH);
-            read(r + s * DEPTH, some, c, c + columns, rows, across);
-            for (Index a = 0; a < columns; a += PANEL)
-                lay_tiles_by_depth<RIGHT>(rows + a, across, columns - a, some, tile_of<T>(out, a, s, steps));
+    // As the right operand of a transposed product, of images without a border.
+    void find(Index r, Index count, const T** rows) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        for (Index k = 0; k < count; k++) {
+            rows[k] = image + ((i * height + y * stride) * width + x * stride) * channels;
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
         }
+    }
+    void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
+        const Index run = kernel_width * channels, row = c / run, at = c - row * run;
+        columns = least(columns, PANEL);
+        if (at + columns <= run) {
+            const Index offset = row * width * channels + at;
+            lay_tiles_by_rows<RIGHT, T>([=](Index j) { return rows[j] + offset; }, columns, count, out);
+            return;
+        }
+        T some[DEPTH * PANEL + 2 * DEPTH];
+        for (Index i = 0; i < count; i++)
+            read_inside(rows[i] + row * width * channels + at, run, at, columns, some + i * PANEL);
+        lay_tiles_by_depth<RIGHT>(some, PANEL, columns, count, out);
     }
 };
 
@@ -181,10 +194,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                     if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
                 };
                 zero_sums();
-                if (outputs - p * PANEL <= TILE)
-                    add_half_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
-                else
-                    add_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
+                add_steps<PARTS<T>>(height(b) > TILE, outputs - p * PANEL > TILE, left, weights + p * panel, steps, turn % 2, meanwhile);
                 store_sums(sums[turn % 2]);
             }
             write(panels * all - 1, 0, PANEL);
