@@ -15,7 +15,7 @@ from torch.autograd import Function
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.native import planner_ops
+from sb3_dreamer_urlb.native import pixel_ops, planner_ops
 from sb3_dreamer_urlb.precision import full
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
@@ -159,12 +159,15 @@ def unit_normal_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
 def image_nll(mean: th.Tensor, target: th.Tensor) -> th.Tensor:
     """:func:`unit_normal_nll` summed over pixels and channels, averaged over the images.
 
-    :param mean: float (…, C, height, width)
+    :param mean: float (…, C, height, width), bfloat16 where kernels of our own compute it
     :param target: same shape
     :return: scalar
     """
     pixels = mean.shape[-3:].numel()
     images = mean.numel() // pixels
+    # Four dimensions can be told to have their channels last in memory.
+    if mean.dim() > 3:
+        mean, target = mean.flatten(0, -4), target.flatten(0, -4)
     distance: th.Tensor = _SquaredDistance.apply(mean, target)  # type: ignore[no-untyped-call]
     return distance / (2 * images) + pixels * HALF_LOG_2PI
 
@@ -174,6 +177,10 @@ class _SquaredDistance(Function):
 
     @staticmethod
     def forward(ctx: FunctionCtx, mean: th.Tensor, target: th.Tensor) -> th.Tensor:
+        if native.active() and pixel_ops.comparable(mean, target):
+            ours, difference = pixel_ops.squared_distance(mean, target)
+            ctx.save_for_backward(difference)
+            return ours  # type: ignore[no-any-return]
         difference = mean - target
         ctx.save_for_backward(difference)
         distance: th.Tensor = th.linalg.vector_norm(difference, dim=(-3, -2, -1))

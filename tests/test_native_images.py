@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
+from gymnasium import spaces
 from test_native import ROUNDING, kernels, threads  # noqa: F401 (fixtures)
 from test_speed import Calls
 from torch import nn
 
-from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.native import image_ops, ops, product_ops
+from sb3_dreamer_urlb import distributions, native
+from sb3_dreamer_urlb.native import image_ops, pixel_ops, product_ops
 from sb3_dreamer_urlb.world_model import convolution
+from sb3_dreamer_urlb.world_model.observations import Images
 
 #: channels and size of the wide image, channels of the narrow one, kernel, stride, images
 SHAPES = [
@@ -141,4 +144,67 @@ def test_no_images(tiles):
     narrow = _image(0, 5, 3, 3, dtype=th.float32)
     assert image_ops.scatter(narrow, th.randn(5, 4, 4, 4), 2, (8, 8), None, False).shape == (0, 4, 8, 8)
     assert not image_ops.weight_gradient(_image(0, 4, 9, 9, dtype=th.float32), narrow, (4, 4), 2).any()
-    assert ops.FORMATS
+
+
+# -- pixels and their loss -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("shape", [(2, 5, 3, 16, 17), (1, 1, 3, 64, 64), (7, 1, 20, 16), (4, 3, 3, 5), (0, 3, 8, 8)], ids=str)
+def test_bytes_become_numbers(kernels, threads, shape, last):  # noqa: F811
+    """To the last bit, and laid out in the same way."""
+    kind = Images(spaces.Box(0, 255, (3, 64, 64), np.uint8))
+    raw = th.randint(0, 256, shape, dtype=th.uint8, generator=th.Generator().manual_seed(0))
+    raw = raw.flatten(0, -4).contiguous(memory_format=th.channels_last).view(shape) if last else raw
+    expected = kind.preprocess(raw)
+    with native.using("native", "cpu"), Calls() as calls:
+        found = kind.preprocess(raw)
+        assert th.equal(kind.preprocess(raw.flip(-1)), expected.flip(-1))
+        assert th.equal(kind.preprocess(raw.transpose(-1, -2)), expected.transpose(-1, -2))
+    assert calls.counts["sb3_dreamer_urlb.scale_images.default"] == 3
+    assert th.equal(found, expected) and found.dtype == th.float32
+    assert found.flatten(0, -4).is_contiguous(memory_format=th.channels_last)
+
+
+@pytest.mark.parametrize("dtype", ROUNDING)
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("shape", [(2, 5, 3, 16, 17), (3, 3, 64, 64), (1, 1, 3, 5)], ids=str)
+def test_loss_of_images(kernels, threads, shape, last, dtype):  # noqa: F811
+    format = th.channels_last if last else th.contiguous_format
+    x, target = (_image(*shape[-4:], dtype=th.float32, seed=i).expand(shape).flatten(0, -4) for i in (3, 4))
+    x, target = x.to(dtype).contiguous(memory_format=format), target.contiguous(memory_format=format)
+    exact = x.double().requires_grad_()
+    expected = distributions.image_nll(exact.view(shape), target.view(shape).double())
+    leaf = x.clone(memory_format=th.preserve_format).requires_grad_()
+    with native.using("native", "cpu"), Calls() as calls:
+        loss = distributions.image_nll(leaf.view(shape), target.view(shape))
+        (3 * loss).backward()
+    assert calls.counts["sb3_dreamer_urlb.squared_distance.default"] == 1
+    assert loss.dtype == th.float32 and loss.item() == pytest.approx(expected.item(), rel=1e-6)
+    (slope,) = th.autograd.grad(3 * expected, exact)
+    assert leaf.grad.stride() == x.stride() and (leaf.grad - slope).abs().max() <= 2 * ROUNDING[dtype] * slope.abs().max()
+
+
+def test_a_loss_that_lies_otherwise_in_memory(kernels):  # noqa: F811
+    mean, target = th.randn(4, 3, 5, 5), _image(4, 3, 5, 5, dtype=th.float32)
+    with native.using("native", "cpu"):
+        assert th.allclose(distributions.image_nll(mean, target), distributions.image_nll(mean, target.contiguous()))
+        assert distributions.image_nll(mean[0], target[0]).isfinite()
+        with pytest.raises(ValueError, match=r"the distance between .* is not computed"):
+            pixel_ops.squared_distance(mean, target)
+        with pytest.raises(TypeError, match=r"takes uint8, got torch\.float32"):
+            pixel_ops.scale_images(mean, 255.0)
+        with pytest.raises(ValueError, match="contiguous or channels last"):
+            pixel_ops.scale_images(th.zeros(2, 3, 4, 5, dtype=th.uint8).transpose(0, 3), 255.0)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_world_models_learn_the_same(kernels, learner, batch, precision):  # noqa: F811
+    found = []
+    for compile in ("eager", "native"):
+        th.manual_seed(0)
+        its = learner(None, compile=compile, precision=precision)
+        with Calls() as calls:
+            found.append([float(its.update(batch)["image_loss"]) for _ in range(3)])
+        assert (calls.counts["sb3_dreamer_urlb.squared_distance.default"] == 3) == (compile == "native")
+    assert found[0] == pytest.approx(found[1], rel=1e-5 if precision == "float32" else 1e-3)

@@ -10,7 +10,6 @@ import ctypes
 from collections.abc import Sequence
 
 import torch as th
-import torch.nn.functional as F
 
 from sb3_dreamer_urlb.native import ops, product_ops
 
@@ -22,6 +21,7 @@ ops.OPTIONAL["has_tiles"].update(
             *(_POINTER, _POINTER, _POINTER, _INDEX, _POINTER),
             *(_INT, _POINTER, _INDEX, _INDEX, _INT),
         ),
+        "arrange_weights_": (_POINTER, _INDEX, _INDEX, _INDEX, _INDEX, _INDEX, _POINTER, _INT),
         "transposed_by_windows_": (_POINTER, _POINTER, _POINTER, _INDEX, _POINTER, _POINTER, _INT),
     }
 )
@@ -37,7 +37,7 @@ def gather(wide: th.Tensor, weight: th.Tensor, stride: int, bias: th.Tensor | No
     """A convolution.
 
     :param wide: float32 or bfloat16 (N, w, …)
-    :param weight: (n, w, height, width), any format
+    :param weight: (n, w, height, width), float32
     :param stride: of the windows
     :param bias: float32 (n,), None for none
     :param elu: whether ELU follows
@@ -47,10 +47,9 @@ def gather(wide: th.Tensor, weight: th.Tensor, stride: int, bias: th.Tensor | No
     n, channels, *kernel = weight.shape
     _check_image(wide, channels)
     _check_bias(bias, n)
-    flat = weight.permute(0, 2, 3, 1).flatten(1).to(wide.dtype)
     grid = _grid(wide, kernel, stride)
     narrow = wide.new_empty(len(wide), *grid, n).permute(0, 3, 1, 2)
-    laid = product_ops.lay_out_weights(flat, False)
+    laid = product_ops.lay_out_weights(_arranged(weight, wide.dtype, 0), False)
     if narrow.numel():
         function(
             *(_shape(wide, kernel, stride, grid, (0, 0), 0), wide.data_ptr(), laid.data_ptr(), n),
@@ -66,7 +65,7 @@ def scatter(
     """A transposed convolution: stride² pixels of the wide image at a time, from the few narrow ones that reach them.
 
     :param narrow: float32 or bfloat16 (N, n, …)
-    :param weight: (n, w, height, width), any format
+    :param weight: (n, w, height, width), float32
     :param stride: of the windows
     :param size: height and width of the wide image; what no window reaches is the bias alone
     :param bias: float32 (w,), None for none
@@ -78,17 +77,14 @@ def scatter(
     _check_image(narrow, n)
     _check_bias(bias, channels)
     few = [-(-side // stride) for side in kernel]
-    weight = F.pad(weight, (0, few[1] * stride - kernel[1], 0, few[0] * stride - kernel[0]))
-    phases = weight.view(n, channels, few[0], stride, few[1], stride).flip(2, 4)
-    flat = phases.permute(2, 4, 0, 3, 5, 1).reshape(few[0] * few[1] * n, -1).to(narrow.dtype)
     grid = [-(-side // stride) for side in size]
     bias = None if bias is None else bias.repeat(stride**2)
     wide = narrow.new_empty(len(narrow), *size, channels).permute(0, 3, 1, 2)
-    laid = product_ops.lay_out_weights(flat, True)
+    laid = product_ops.lay_out_weights(_arranged(weight, narrow.dtype, stride), True)
     if wide.numel():
         shape = _shape(narrow, few, 1, grid, (few[0] - 1, few[1] - 1), stride)
         function(
-            *(shape, narrow.data_ptr(), laid.data_ptr(), flat.shape[1]),
+            *(shape, narrow.data_ptr(), laid.data_ptr(), stride**2 * channels),
             *(None if bias is None else bias.data_ptr(), elu, wide.data_ptr(), *size, th.get_num_threads()),
         )
     return wide
@@ -111,12 +107,26 @@ def weight_gradient(wide: th.Tensor, narrow: th.Tensor, kernel: Sequence[int], s
     if narrow.dtype != wide.dtype or len(narrow) != len(wide) or list(narrow.shape[2:]) != grid:
         raise ValueError(f"windows {tuple(kernel)} of {ops._describe(wide)} do not belong to {ops._describe(narrow)}.")
     depth, threads = kernel[0] * kernel[1] * channels, th.get_num_threads()
-    out = th.empty(n, *kernel, channels) if narrow.numel() else th.zeros(n, *kernel, channels)
+    out = th.empty(n, channels, *kernel) if narrow.numel() else th.zeros(n, channels, *kernel)
     if narrow.numel():
         sums = th.empty(threads * product_ops._up(n) * product_ops._up(depth))
         shape = _shape(wide, kernel, stride, grid, (0, 0), 0)
         function(shape, wide.data_ptr(), narrow.data_ptr(), n, sums.data_ptr(), out.data_ptr(), threads)
-    return out.permute(0, 3, 1, 2)
+    return out
+
+
+def _arranged(weight: th.Tensor, dtype: th.dtype, stride: int) -> th.Tensor:
+    """In the order of windows, (n, height · width · w); if there is a stride, in that of :func:`scatter`'s phases."""
+    n, channels, height, width = weight.shape
+    if weight.dtype != th.float32 or not weight.is_contiguous():
+        weight = weight.float().contiguous()
+    rows, columns = n, height * width * channels
+    if stride:
+        rows, columns = -(-height // stride) * -(-width // stride) * n, stride**2 * channels
+    arranged = th.empty(rows, columns, dtype=dtype)
+    function = ops._of_format("arrange_weights_", arranged)
+    function(weight.data_ptr(), n, channels, height, width, stride, arranged.data_ptr(), th.get_num_threads())
+    return arranged
 
 
 def _grid(wide: th.Tensor, kernel: Sequence[int], stride: int) -> list[int]:

@@ -9,6 +9,16 @@
 
 static inline Index most(Index a, Index b) { return a > b ? a : b; }
 
+// `count` numbers, `apart` from one to the next, in another format one after the other.
+template <class T>
+static inline void convert(const float* x, Index apart, Index count, T* out) {
+    const __m512i places = _mm512_mullo_epi32(_mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0), _mm512_set1_epi32(apart));
+    for (; count >= LANES; count -= LANES, x += LANES * apart, out += LANES)
+        store(out, (Floats)_mm512_i32gather_ps(places, x, sizeof(float)));
+    if (count > 0)
+        store(out, (Floats)_mm512_mask_i32gather_ps(_mm512_setzero_ps(), first(count), places, x, sizeof(float)), count);
+}
+
 // What follows `count` numbers at `out` up to a step is overwritten with zeros.
 static inline void copy(const BF16* x, Index count, BF16* out) {
     for (; count >= DEPTH; count -= DEPTH, x += DEPTH, out += DEPTH) _mm512_storeu_si512(out, _mm512_loadu_si512(x));
@@ -85,16 +95,29 @@ struct Windows {
         }
     }
 
-    // As the right operand of a transposed product.
-    static Index scratch(Index columns) { return DEPTH * (columns + 2 * DEPTH); }
-    void lay_out(Index r, Index count, Index c, Index columns, T* rows, uint16_t* out) const {
-        const Index steps = steps_of(count), across = up_to(columns, DEPTH) + DEPTH;
-        for (Index s = 0; s < steps; s++) {
-            const Index some = least(count - s * DEPTH, DEPTH);
-            read(r + s * DEPTH, some, c, c + columns, rows, across);
-            for (Index a = 0; a < columns; a += PANEL)
-                lay_tiles_by_depth<RIGHT>(rows + a, across, columns - a, some, tile_of<T>(out, a, s, steps));
+    // As the right operand of a transposed product, of images without a border.
+    void find(Index r, Index count, const T** rows) const {
+        Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
+        for (Index k = 0; k < count; k++) {
+            rows[k] = image + ((i * height + y * stride) * width + x * stride) * channels;
+            if (++x == grid_width) {
+                x = 0;
+                if (++y == grid_height) y = 0, i++;
+            }
         }
+    }
+    void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
+        const Index run = kernel_width * channels, row = c / run, at = c - row * run;
+        columns = least(columns, PANEL);
+        if (at + columns <= run) {
+            const Index offset = row * width * channels + at;
+            lay_tiles_by_rows<RIGHT, T>([=](Index j) { return rows[j] + offset; }, columns, count, out);
+            return;
+        }
+        T some[DEPTH * PANEL + 2 * DEPTH];
+        for (Index i = 0; i < count; i++)
+            read_inside(rows[i] + row * width * channels + at, run, at, columns, some + i * PANEL);
+        lay_tiles_by_depth<RIGHT>(some, PANEL, columns, count, out);
     }
 };
 
@@ -171,14 +194,45 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                     if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
                 };
                 zero_sums();
-                if (outputs - p * PANEL <= TILE)
-                    add_half_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
-                else
-                    add_steps<PARTS<T>>(left, weights + p * panel, steps, turn % 2, meanwhile);
+                add_steps<PARTS<T>>(height(b) > TILE, outputs - p * PANEL > TILE, left, weights + p * panel, steps, turn % 2, meanwhile);
                 store_sums(sums[turn % 2]);
             }
             write(panels * all - 1, 0, PANEL);
             if (pixels) pixels->write(r, count, results);
+        }
+    }
+}
+
+// -- weights ------------------------------------------------------------------------------------------------------------
+
+// Weights (narrow, wide, height, width) as rows (narrow) of windows (height, width, wide).
+template <class T>
+static void weights_of_windows(const float* weight, Index narrow, Index wide, Index height, Index width, T* out, int threads) {
+    const Index places = height * width;
+#pragma omp parallel for num_threads(threads) if (narrow * wide * places > WORTH_A_THREAD)
+    for (Index n = 0; n < narrow; n++)
+        for (Index p = 0; p < places; p++)
+            convert(weight + n * wide * places + p, places, wide, out + (n * places + p) * wide);
+}
+
+// The same as what the narrow pixels (few high, few wide, narrow) do to stride² wide ones (stride, stride, wide): the last narrow
+// pixel meets the kernel's first numbers. Where the stride does not divide the kernel there are zeros.
+template <class T>
+static void weights_of_phases(const float* weight, Index narrow, Index wide, Index height, Index width, Index stride, T* out,
+                              int threads) {
+    const Index places = height * width, few_high = (height + stride - 1) / stride, few_wide = (width + stride - 1) / stride;
+#pragma omp parallel for num_threads(threads) if (narrow * wide * places > WORTH_A_THREAD)
+    for (Index n = 0; n < narrow; n++) {
+        for (Index few = 0; few < few_high * few_wide; few++) {
+            T* to = out + (few * narrow + n) * stride * stride * wide;
+            const Index top = (few_high - 1 - few / few_wide) * stride, left = (few_wide - 1 - few % few_wide) * stride;
+            for (Index pixel = 0; pixel < stride * stride; pixel++, to += wide) {
+                const Index y = top + pixel / stride, x = left + pixel % stride;
+                if (y < height && x < width)
+                    convert(weight + n * wide * places + y * width + x, places, wide, to);
+                else
+                    std::memset((void*)to, 0, wide * sizeof(T));
+            }
         }
     }
 }
@@ -200,11 +254,18 @@ static Windows<T> windows_of(const Index* shape, const T* image) {
         const Pixels<T> pixels{out, out_height, out_width, outputs / most(step * step, 1), step, windows.grid_height, windows.grid_width}; \
         windows_by_weights(windows, shape[0] * grid, weights, outputs, behind, step ? &pixels : nullptr, threads);     \
     }                                                                                                                  \
+    EXPORT void arrange_weights_##NAME(const float* weight, Index narrow, Index wide, Index height, Index width, Index stride, T* out, \
+                                       int threads) {                                                                  \
+        if (stride)                                                                                                    \
+            weights_of_phases(weight, narrow, wide, height, width, stride, out, threads);                              \
+        else                                                                                                           \
+            weights_of_windows(weight, narrow, wide, height, width, out, threads);                                     \
+    }                                                                                                                  \
     EXPORT void transposed_by_windows_##NAME(const Index* shape, const T* image, const T* left, Index m, float* sums, float* out, \
                                              int threads) {                                                            \
         const Windows<T> windows = windows_of(shape, image);                                                           \
         const Index rows = shape[0] * windows.grid_height * windows.grid_width;                                        \
-        transposed_product(left, m, windows, sums, out, rows, m, windows.depth(), threads);                            \
+        transposed_product(left, m, windows, sums, out, rows, m, windows.depth(), shape[4] * shape[5], threads);       \
     }
 
 FOR(float, float)

@@ -71,7 +71,7 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
     }                                                                                                                  \
     EXPORT void transposed_product_##NAME(const T* left, Index left_stride, const T* right, Index right_stride, float* sums, \
                                           float* out, Index rows, Index m, Index n, int threads) {                     \
-        transposed_product(left, left_stride, PlainRows<T>{right, right_stride}, sums, out, rows, m, n, threads);       \
+        transposed_product(left, left_stride, PlainRows<T>{right, right_stride}, sums, out, rows, m, n, 1, threads);    \
     }
 FOR(float, float)
 FOR(BF16, bfloat16)

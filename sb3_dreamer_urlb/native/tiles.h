@@ -124,14 +124,14 @@ static inline void store_two(BF16* p, Two x, __mmask32 mask) {
 
 enum Side { LEFT, RIGHT };
 
-// Two tiles of x (depth, across), next to each other.
-template <Side side, class T>
-static inline void lay_tiles_by_depth(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
+// Two tiles of x (depth, across), next to each other; `at` tells where its rows are.
+template <Side side, class T, class Rows>
+static inline void lay_tiles_by_rows(Rows at, Index across, Index depth, uint16_t* out) {
     __m512i p[PARTS<T>], q[PARTS<T>], tiles[PARTS<T>][2][TILE];
     const __mmask32 mask = first(across);
-    for (Index j = 0; j < TILE; j++, x += 2 * stride) {
-        row(x, 2 * j < depth ? mask : 0, p);
-        row(x + stride, 2 * j + 1 < depth ? mask : 0, q);
+    for (Index j = 0; j < TILE; j++) {
+        row(at(2 * j), 2 * j < depth ? mask : 0, p);
+        row(at(2 * j + 1), 2 * j + 1 < depth ? mask : 0, q);
         for (int i = 0; i < PARTS<T>; i++) interleave(p[i], q[i], tiles[i][0][j], tiles[i][1][j]);
     }
     for (int i = 0; i < PARTS<T>; i++) {
@@ -140,6 +140,10 @@ static inline void lay_tiles_by_depth(const T* x, Index stride, Index across, In
             for (Index j = 0; j < TILE; j++) _mm512_store_si512(out + j * DEPTH, tiles[i][half][j]);
         }
     }
+}
+template <Side side, class T>
+static inline void lay_tiles_by_depth(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
+    lay_tiles_by_rows<side, T>([=](Index j) { return x + j * stride; }, across, depth, out);
 }
 
 // One tile of x (across, depth), as the right operand.
@@ -243,37 +247,46 @@ static inline void add_step(const Left& a, Index at, const uint16_t* b) {
     }
 }
 
-// The same for the right operand's first 16 columns alone: sums 0 and 2.
-template <int parts>
-static inline void add_half_step(const Left& a, Index at, const uint16_t* b) {
+// The same where there are fewer rows (tall: 1 for 16) or columns (wide).
+template <int parts, int tall, int wide>
+static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
     for (int left = 0; left < parts; left++) {
-        LOAD_LEFT(left);
+        _tile_loadd(4, a.upper + at + 2 * left * NUMBERS, a.row_bytes);
+        if (tall == 2) _tile_loadd(5, a.lower + at + 2 * left * NUMBERS, a.row_bytes);
         for (int right = 0; right < parts - left; right++) {
             _tile_loadd(6, b + 2 * right * NUMBERS, 64);
+            if (wide == 2) _tile_loadd(7, b + (2 * right + 1) * NUMBERS, 64);
             _tile_dpbf16ps(0, 4, 6);
-            _tile_dpbf16ps(2, 5, 6);
+            if (wide == 2) _tile_dpbf16ps(1, 4, 7);
+            if (tall == 2) _tile_dpbf16ps(2, 5, 6);
+            if (tall == 2 && wide == 2) _tile_dpbf16ps(3, 5, 7);
         }
     }
 }
 
 // All steps. Who goes backwards every other time finds what was read last in the nearest cache. Between the steps goes on
 // what else there is to do: tiles are multiplied beside it.
-template <int parts, class Meanwhile>
+template <int parts, int tall = 2, int wide = 2, class Meanwhile>
 static inline void add_steps(const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
     for (Index i = 0; i < steps; i++) {
         const Index s = backwards ? steps - 1 - i : i;
-        add_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+        if (tall == 2 && wide == 2)
+            add_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+        else
+            add_some_step<parts, tall, wide>(a, s * a.step, b + s * 2 * parts * NUMBERS);
         meanwhile(i);
     }
 }
-
 template <int parts, class Meanwhile>
-static inline void add_half_steps(const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
-    for (Index i = 0; i < steps; i++) {
-        const Index s = backwards ? steps - 1 - i : i;
-        add_half_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
-        meanwhile(i);
-    }
+static inline void add_steps(bool tall, bool wide, const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
+    if (tall && wide)
+        add_steps<parts>(a, b, steps, backwards, meanwhile);
+    else if (tall)
+        add_steps<parts, 2, 1>(a, b, steps, backwards, meanwhile);
+    else if (wide)
+        add_steps<parts, 1, 2>(a, b, steps, backwards, meanwhile);
+    else
+        add_steps<parts, 1, 1>(a, b, steps, backwards, meanwhile);
 }
 
 static inline void load_sums(const float* c) {

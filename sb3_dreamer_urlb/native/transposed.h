@@ -5,7 +5,8 @@
 
 #ifdef HAS_TILES
 
-constexpr Index ROWS = 320, COLUMNS = 512;  // laid out at a time: together with their sums, what a core's cache holds
+constexpr Index ROWS = 320, COLUMNS = 512;  // laid out at a time, at most
+constexpr Index CACHE = 3 << 19;              // bytes: most of a core's
 
 // Rows of a matrix (rows, n), `stride` apart, as the right operand.
 template <class T>
@@ -13,66 +14,134 @@ struct PlainRows {
     const T* x;
     Index stride;
 
-    static Index scratch(Index) { return 0; }
-    void lay_out(Index r, Index count, Index c, Index columns, T*, uint16_t* out) const {
-        lay_out_by_depth<RIGHT>(x + r * stride + c, stride, columns, count, out);
+    void find(Index r, Index count, const T** rows) const {
+        for (Index i = 0; i < count; i++) rows[i] = x + (r + i) * stride;
+    }
+    // Columns from c on of up to 32 of these rows.
+    void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
+        lay_tiles_by_rows<RIGHT, T>([=](Index j) { return rows[j] + c; }, columns, count, out);
     }
 };
 
+// Some rows and columns of both operands, laid out piece by piece, 32 rows × 32 columns each: the left one's first.
+template <class T, class Right>
+struct Piece {
+    const T* left;
+    Index left_stride, m;
+    const Right* right;
+    Index begin, count, c, columns;
+    const T* rows[ROWS + DEPTH];
+    uint16_t *laid_left, *laid_right;
+    Index step = 0, across = 0;
+    bool at_right = false;
+
+    void start(Index its_begin, Index its_count, Index its_c, Index its_columns) {
+        begin = its_begin, count = its_count, c = its_c, columns = its_columns;
+        step = across = 0, at_right = false;
+        right->find(begin, count, rows);
+        for (Index i = count; i < up_to(count, DEPTH); i++) rows[i] = rows[0];
+    }
+    Index pieces() const { return steps_of(count) * (up_to(m, PANEL) + up_to(columns, PANEL)) / PANEL; }
+    void lay_out_one() {
+        const Index steps = steps_of(count), r = step * DEPTH, some = least(count - r, DEPTH);
+        if (at_right)
+            right->lay_out(rows + r, some, c + across, columns - across, tile_of<T>(laid_right, across, step, steps));
+        else
+            lay_tiles_by_depth<LEFT>(left + (begin + r) * left_stride + across, left_stride, m - across, some,
+                                     tile_of<T>(laid_left, across, step, steps));
+        across += PANEL;
+        if (across >= (at_right ? columns : m)) {
+            across = 0;
+            if (++step == steps) step = 0, at_right = true;
+        }
+    }
+};
+
+// While some rows are multiplied, the next ones are laid out.
 template <class T, class Right>
 static void add_transposed_product(const T* left, Index left_stride, const Right& right, float* sums, Index begin, Index rows, Index m,
                                    Index n) {
     static thread_local Scratch scratch;
-    const Index size = least(up_to(rows, DEPTH), ROWS), wide = least(n, COLUMNS);
-    const Index laid = laid_size<T>(m, size) + laid_size<T>(wide, size);
-    uint16_t* laid_left = (uint16_t*)scratch.get(laid * sizeof(uint16_t) + right.scratch(wide) * sizeof(T));
-    uint16_t* laid_right = laid_left + laid_size<T>(m, size);
-    T* its = (T*)(laid_left + laid);
+    const Index wide = least(n, COLUMNS), across = up_to(m, PANEL) + up_to(wide, PANEL);
+    // Both pieces and the sums stay in a core's cache.
+    const Index room = CACHE - up_to(m, PANEL) * wide * sizeof(float), fit = room / (2 * across * PARTS<T> * (Index)sizeof(uint16_t));
+    const Index size = least(least(up_to(rows, DEPTH), ROWS), fit < 4 * DEPTH ? 4 * DEPTH : fit / DEPTH * DEPTH);
+    const Index laid_left = laid_size<T>(m, size), laid = laid_left + laid_size<T>(wide, size);
+    uint16_t* memory = (uint16_t*)scratch.get(2 * laid * sizeof(uint16_t));
+    Piece<T, Right> pieces[2];
+    for (int i = 0; i < 2; i++, memory += laid) {
+        pieces[i].left = left, pieces[i].left_stride = left_stride, pieces[i].m = m, pieces[i].right = &right;
+        pieces[i].laid_left = memory, pieces[i].laid_right = memory + laid_left;
+    }
     Tiles tiles;
+    pieces[0].start(begin, least(rows, size), 0, wide);
+    for (Index k = pieces[0].pieces(); k > 0; k--) pieces[0].lay_out_one();
+    int turn = 0;
     for (Index c = 0; c < n; c += COLUMNS) {
-        const Index columns = least(n - c, COLUMNS);
-        for (Index r = 0; r < rows; r += size) {
-            const Index count = least(rows - r, size), panel = steps_of(count) * 2 * PARTS<T> * NUMBERS;
-            lay_out_by_depth<LEFT>(left + (begin + r) * left_stride, left_stride, m, count, laid_left);
-            right.lay_out(begin + r, count, c, columns, its, laid_right);
+        for (Index r = 0; r < rows; r += size, turn = 1 - turn) {
+            Piece<T, Right>&now = pieces[turn], &next = pieces[1 - turn];
+            const Index steps = steps_of(now.count), panel = steps * 2 * PARTS<T> * NUMBERS;
+            Index left_over = 0;
+            if (r + size < rows)
+                next.start(begin + r + size, least(rows - r - size, size), c, now.columns), left_over = next.pieces();
+            else if (c + COLUMNS < n)
+                next.start(begin, least(rows, size), c + COLUMNS, least(n - c - COLUMNS, COLUMNS)), left_over = next.pieces();
+            const Index share = left_over, all = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL) * steps;
+            Index credit = 0;
+            const auto meanwhile = [&](Index) {
+                for (credit += share; credit >= all && left_over > 0; credit -= all, left_over--) next.lay_out_one();
+            };
             float* sum = sums + up_to(m, PANEL) * c;
             for (Index i = 0; i < m; i += PANEL) {
-                for (Index j = 0; j < columns; j += PANEL, sum += PANEL * PANEL) {
+                for (Index j = 0; j < now.columns; j += PANEL, sum += PANEL * PANEL) {
                     for (Index k = 0; k < PANEL * PANEL; k += TILE) __builtin_prefetch(sum + PANEL * PANEL + k, 1);
                     if (r > 0)
                         load_sums(sum);
                     else
                         zero_sums();
-                    add_steps<PARTS<T>>(Left(laid_left + i / PANEL * panel, PARTS<T>), laid_right + j / PANEL * panel, steps_of(count),
-                                        j / PANEL % 2, [](Index) {});
+                    add_steps<PARTS<T>>(m - i > TILE, now.columns - j > TILE, Left(now.laid_left + i / PANEL * panel, PARTS<T>),
+                                        now.laid_right + j / PANEL * panel, steps, j / PANEL % 2, meanwhile);
                     store_sums(sum);
                 }
             }
+            for (; left_over > 0; left_over--) next.lay_out_one();
         }
     }
 }
 
-// sums: room for threads · up_to(m, 32) · up_to(n, 32).
+// Row i of the product of all threads, n numbers.
+static inline void gather_row(const float* sums, Index i, Index m, Index n, Index threads, float* row) {
+    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
+    for (Index j = 0; j < n; j += TILE) {
+        const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
+        const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
+        const float* at = sums + block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE;
+        Floats total = load(at);
+        for (Index t = 1; t < threads; t++) total += load(at + t * size);
+        _mm512_mask_storeu_ps(row + j, first(least(n - j, TILE)), (__m512)total);
+    }
+}
+
+// sums: room for threads · up_to(m, 32) · up_to(n, 32). A row of the product, (places, n / places), becomes (n / places, places).
 template <class T, class Right>
 static void transposed_product(const T* left, Index left_stride, const Right& right, float* sums, float* out, Index rows, Index m,
-                               Index n, int threads) {
-    const Index size = up_to(m, PANEL) * up_to(n, PANEL);
+                               Index n, Index places, int threads) {
+    const Index size = up_to(m, PANEL) * up_to(n, PANEL), few = n / places;
 #pragma omp parallel num_threads(threads)
     {
         const Index share = up_to((rows + omp_get_num_threads() - 1) / omp_get_num_threads(), DEPTH);
         const Index me = omp_get_thread_num(), us = (rows + share - 1) / share, begin = share * me, count = least(rows - begin, share);
         if (count > 0) add_transposed_product(left, left_stride, right, sums + me * size, begin, count, m, n);
 #pragma omp barrier
+        static thread_local Scratch scratch;
+        float* row = (float*)scratch.get(n * sizeof(float));
 #pragma omp for schedule(static)
         for (Index i = 0; i < m; i++) {
-            for (Index j = 0; j < n; j++) {
-                const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
-                const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
-                const Index at = block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE + j % TILE;
-                float total = 0;
-                for (Index t = 0; t < us; t++) total += sums[t * size + at];
-                out[i * n + j] = total;
-            }
+            float* to = out + i * n;
+            gather_row(sums, i, m, n, us, places > 1 ? row : to);
+            if (places > 1)
+                for (Index f = 0; f < few; f++)
+                    for (Index p = 0; p < places; p++) *to++ = row[p * few + f];
         }
     }
 }

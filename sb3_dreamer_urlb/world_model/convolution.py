@@ -48,7 +48,7 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     if x.device.type != "cpu" or not th.is_grad_enabled():
         return layer(x)
     dtype = _dtype(x)
-    if _on_tiles(layer, x):
+    if convolves_on_tiles(layer, x):
         return _tiles(layer, x, False)
     form = _form(layer, x, dtype)
     if form is None:
@@ -63,7 +63,7 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
 
 def convolve_elu(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     """ELU behind :func:`convolve`, whose parameters it takes."""
-    if x.device.type == "cpu" and th.is_grad_enabled() and _on_tiles(layer, x):
+    if convolves_on_tiles(layer, x):
         return _tiles(layer, x, True)
     return elu_(convolve(layer, x))
 
@@ -73,8 +73,11 @@ def _dtype(x: th.Tensor) -> th.dtype:
     return th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
 
 
-def _on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> bool:
-    if not native.active() or _dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
+def convolves_on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> bool:
+    """Whether kernels of our own do it; parameters as those of :func:`convolve`."""
+    if not native.active() or x.device.type != "cpu" or not th.is_grad_enabled():
+        return False
+    if _dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
         return False
     narrow = x.shape[-2:]
     if isinstance(layer, nn.Conv2d):
@@ -85,7 +88,10 @@ def _on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> bool:
 def _tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, elu: bool) -> th.Tensor:
     # Outside of the function, so that autograd brings x's gradient back.
     x, transposed = x.to(_dtype(x)), isinstance(layer, nn.ConvTranspose2d)
-    y: th.Tensor = _OnTiles.apply(x, layer.weight, layer.bias, layer.stride[0], transposed, elu)  # type: ignore[no-untyped-call]
+    # A single pixel meets the whole kernel at once.
+    kernel = layer.kernel_size
+    stride = kernel[0] if transposed and x.shape[-2:] == (1, 1) and kernel[0] == kernel[1] else layer.stride[0]
+    y: th.Tensor = _OnTiles.apply(x, layer.weight, layer.bias, stride, transposed, elu)  # type: ignore[no-untyped-call]
     return y
 
 

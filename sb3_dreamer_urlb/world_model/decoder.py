@@ -8,10 +8,11 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.precision import full
-from sb3_dreamer_urlb.world_model.convolution import convolve_elu
+from sb3_dreamer_urlb.world_model.convolution import convolve_elu, convolves_on_tiles
 
 
 def deconvolution_kernels(size: int) -> list[int]:
@@ -58,19 +59,24 @@ class ConvDecoder(nn.Module):
     def forward(self, feature: th.Tensor) -> th.Tensor:
         """
         :param feature: float (…, F)
-        :return: mean image, float (…, C, height, width)
+        :return: mean image, float (…, C, height, width); what kernels of our own learn from may be bfloat16
         """
         x = self._grow(linear(feature.flatten(0, -2), self.input.weight, self.input.bias))
         for deconv in self.deconvs[1:]:
             assert isinstance(deconv, nn.ConvTranspose2d)
             x = convolve_elu(deconv, x)
-        return full(x).reshape(feature.shape[:-1] + x.shape[1:])
+        # The loss takes the short format as it is.
+        x = x if native.active() and th.is_grad_enabled() else full(x)
+        return x.reshape(feature.shape[:-1] + x.shape[1:])
 
     def _grow(self, x: th.Tensor) -> th.Tensor:
         """The first transposed convolution and its ELU: on a 1×1 map it is a plain matrix product, which is faster."""
         first = self.deconvs[0]
         assert isinstance(first, nn.ConvTranspose2d) and first.bias is not None
         channels, out, height, width = first.weight.shape
+        image = x.view(-1, channels, 1, 1)
+        if convolves_on_tiles(first, image):
+            return convolve_elu(first, image)
         # Channels last, as all that follow.
         weight = first.weight.permute(0, 2, 3, 1).reshape(channels, -1).T
         return linear_elu(x, weight, first.bias.repeat(height * width)).view(-1, height, width, out).permute(0, 3, 1, 2)

@@ -16,9 +16,10 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb import distributions, native
 from sb3_dreamer_urlb.choices import classes_of, one_hot_numbers
 from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb.native import pixel_ops
 from sb3_dreamer_urlb.types import Metrics, Observation
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, DictDecoder, VectorDecoder
 from sb3_dreamer_urlb.world_model.encoder import ConvEncoder, DictEncoder, Encoder, VectorEncoder
@@ -93,6 +94,9 @@ class Images(Observations):
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
+        if native.active() and raw.dtype == th.uint8 and raw.device.type == "cpu" and raw.dim() > 3 and self.low == 0:
+            its: th.Tensor = pixel_ops.scale_images(_channels_somewhere(raw.flatten(0, -4)), self.range)
+            return its.view(raw.shape)
         image = raw if raw.dtype == th.uint8 else raw.to(th.float32)
         if image.dim() > 3:
             # Channels last in memory, as convolutions like it; cheapest while a pixel is a byte.
@@ -113,6 +117,11 @@ class Images(Observations):
         assert isinstance(raw, th.Tensor)
         if self.dtype is not None and raw.dtype != self.dtype:
             raise ValueError(f"Images must be uint8 in [0, 255], got {raw.dtype}.")
+
+
+def _channels_somewhere(image: th.Tensor) -> th.Tensor:
+    """Contiguous, with channels first or last."""
+    return image if image.is_contiguous(memory_format=th.channels_last) else image.contiguous()
 
 
 class Vectors(Observations):
