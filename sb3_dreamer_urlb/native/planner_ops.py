@@ -24,6 +24,8 @@ ops.ARGUMENTS.update(
         "draws_": (*[_POINTER] * 5, *[_INDEX] * 4, _INT),
         "gather_": GATHER,
         "gather_half": GATHER,
+        "gates_": (_POINTER, _POINTER, _POINTER, _FLOAT, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
+        "gates_backward_": (*[_POINTER] * 4, _FLOAT, *[_POINTER] * 3, _INDEX, _INDEX, _INT),
         "softmax_backward_": (_POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
         "recurrence_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
     }
@@ -193,6 +195,50 @@ def recurrence(
         *(n, size, th.get_num_threads()),
     )
     return new
+
+
+@ops.operator("gates(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old) -> Tensor")
+def gates(parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor) -> th.Tensor:
+    """:func:`recurrence` with parts as a learning RSSM has them: reset, candidate, update, and no −1 in the bias.
+
+    :return: the new state, float32 (n, D)
+    """
+    function = ops._of_format("gates_", parts)
+    n, size = _check_gates(parts, weight, bias, old)
+    new = th.empty_like(old)
+    places = [tensor.data_ptr() for tensor in (parts, weight, bias)]
+    function(*places, epsilon, old.data_ptr(), new.data_ptr(), n, size, th.get_num_threads())
+    return new
+
+
+@ops.operator(
+    "gates_backward(Tensor grad, Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old) -> (Tensor, Tensor)"
+)
+def gates_backward(
+    grad: th.Tensor, parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
+    """Gradients of :func:`gates`.
+
+    :param grad: of the new state, float32 (n, D), contiguous
+    :return: of the parts, in their format, and of the state before
+    """
+    function = ops._of_format("gates_backward_", parts)
+    n, size = _check_gates(parts, weight, bias, old)
+    _check("a new state's gradient", grad, th.float32, (n, size))
+    parts_grad, old_grad = th.empty_like(parts), th.empty_like(old)
+    places = [tensor.data_ptr() for tensor in (grad, parts, weight, bias)]
+    others = [tensor.data_ptr() for tensor in (old, parts_grad, old_grad)]
+    function(*places, epsilon, *others, n, size, th.get_num_threads())
+    return parts_grad, old_grad
+
+
+def _check_gates(parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, old: th.Tensor) -> tuple[int, int]:
+    n, size = old.shape
+    _check("parts", parts, parts.dtype, (n, 3 * size))
+    _check("a norm's weight", weight, th.float32, (3 * size,))
+    _check("a norm's bias", bias, th.float32, (3 * size,))
+    _check("the state before", old, th.float32, (n, size))
+    return n, size
 
 
 def _check(what: str, x: th.Tensor, dtype: th.dtype, shape: tuple[int, ...]) -> None:

@@ -11,6 +11,7 @@ from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.dense import linear, linear_elu
 from sb3_dreamer_urlb.precision import full
 from sb3_dreamer_urlb.types import LatentState
+from sb3_dreamer_urlb.world_model.gru import recur
 
 
 class RSSM(nn.Module):
@@ -100,7 +101,8 @@ class RSSM(nn.Module):
         """
         keep = (~is_first).to(embed.dtype).unsqueeze(-1)
         deter = self._recur(state.masked(keep), self._action_part(action * keep))
-        return LatentState(self._sample(self._posterior(deter, self._embed_part(embed)), generator), deter)
+        deter_weight = self.post_hidden.weight[:, : self.deter_size]
+        return LatentState(self._sample(self._posterior(deter, self._embed_part(embed), deter_weight), generator), deter)
 
     def observe(self, embed: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> tuple[LatentState, th.Tensor, th.Tensor]:
         """Infer the states of replayed sequences.
@@ -116,11 +118,14 @@ class RSSM(nn.Module):
         keep = (~is_first).to(embed.dtype).unsqueeze(-1)
         action_parts = self._action_part(action * keep).unbind(1)
         embed_parts = self._embed_part(embed).unbind(1)
+        # Cut out once, so that the gradients of all steps are added up before they are put back into the whole.
+        stoch_weight, deter_weight = self.input.weight[:, : self.stoch_size], self.post_hidden.weight[:, : self.deter_size]
         state = self.initial(embed.shape[0])
         stochs, deters, logits = [], [], []
         for action_part, embed_part, keep_t in zip(action_parts, embed_parts, keep.unbind(1), strict=True):
-            deter = self._recur(state.masked(keep_t), action_part)
-            post_logits = self._posterior(deter, embed_part)
+            state = state.masked(keep_t)
+            deter = self._recur(state, action_part, F.linear(state.stoch, stoch_weight))
+            post_logits = self._posterior(deter, embed_part, deter_weight)
             state = LatentState(self._sample(post_logits), deter)
             stochs.append(state.stoch)
             deters.append(deter)
@@ -141,11 +146,7 @@ class RSSM(nn.Module):
             stoch_part = linear(state.stoch, self.input.weight[:, : self.stoch_size], None)
         x = elu_(stoch_part + action_part)
         gates = linear(th.cat([x, state.deter], -1), self.gru.weight, self.gru.bias)
-        parts = self.gru_norm(full(gates))
-        reset, candidate, update = parts.chunk(3, -1)
-        candidate = th.tanh(th.sigmoid(reset) * candidate)
-        # The bias of −1 makes a fresh GRU forget slowly (DreamerV2).
-        return th.lerp(state.deter, candidate, th.sigmoid(update - 1))
+        return recur(gates, self.gru_norm, state.deter)
 
     def _prior(self, deter: th.Tensor) -> th.Tensor:
         return full(self._prior_logits(deter))
@@ -154,8 +155,8 @@ class RSSM(nn.Module):
         hidden = linear_elu(deter, self.prior_hidden.weight, self.prior_hidden.bias)
         return linear(hidden, self.prior_logits.weight, self.prior_logits.bias).view(deter.shape[:-1] + self.logits_shape)
 
-    def _posterior(self, deter: th.Tensor, embed_part: th.Tensor) -> th.Tensor:
-        hidden = elu_(F.linear(deter, self.post_hidden.weight[:, : self.deter_size]) + embed_part)
+    def _posterior(self, deter: th.Tensor, embed_part: th.Tensor, deter_weight: th.Tensor) -> th.Tensor:
+        hidden = elu_(F.linear(deter, deter_weight) + embed_part)
         return full(self.post_logits(hidden)).view(deter.shape[:-1] + self.logits_shape)
 
     @staticmethod
