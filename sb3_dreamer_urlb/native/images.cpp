@@ -107,17 +107,31 @@ struct Windows {
         }
     }
     void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
-        const Index run = kernel_width * channels, row = c / run, at = c - row * run;
-        columns = least(columns, PANEL);
-        if (at + columns <= run) {
-            const Index offset = row * width * channels + at;
-            lay_tiles_by_rows<RIGHT, T>([=](Index j) { return rows[j] + offset; }, columns, count, out);
-            return;
+        const Index run = kernel_width * channels, line = width * channels, row_of = c / run, at = c - row_of * run;
+        if (at + least(columns, PANEL) <= run) {
+            const Index start = row_of * line + at;
+            const __mmask32 mask = first(columns);
+            lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j] + start, mask, parts); }, count, out);
+        } else if (at + least(columns, PANEL) <= 4 * run) {
+            lay_out_pieces<4>(rows, count, c, least(columns, PANEL), out);
+        } else {
+            lay_out_pieces<PANEL>(rows, count, c, least(columns, PANEL), out);
         }
-        T some[DEPTH * PANEL + 2 * DEPTH];
-        for (Index i = 0; i < count; i++)
-            read_inside(rows[i] + row * width * channels + at, run, at, columns, some + i * PANEL);
-        lay_tiles_by_depth<RIGHT>(some, PANEL, columns, count, out);
+    }
+    template <int most_pieces>
+    void lay_out_pieces(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
+        const Index run = kernel_width * channels, line = width * channels;
+        Index starts[most_pieces] = {};
+        __mmask32 masks[most_pieces] = {};
+        int pieces = 0;
+        for (Index at = 0; at < columns; pieces++) {
+            const Index row_of = (c + at) / run, length = least((row_of + 1) * run - c - at, columns - at);
+            starts[pieces] = row_of * line + c - row_of * run;
+            masks[pieces] = first(at + length) & ~first(at);
+            at += length;
+        }
+        if (most_pieces < PANEL) pieces = most_pieces;
+        lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j], starts, masks, pieces, parts); }, count, out);
     }
 };
 
@@ -127,14 +141,16 @@ struct Pixels {
     T* image;
     Index height, width, channels, stride, grid_height, grid_width;
 
-    void write(Index r, Index count, const T* results) const {
+    void write(Index i, Index y, Index x, const T* result) const {
+        const Index run = stride * channels, rows = least(height - y * stride, stride);
+        const Index length = least(width - x * stride, stride) * channels;
+        T* to = image + ((i * height + y * stride) * width + x * stride) * channels;
+        for (Index row = 0; row < rows; row++) copy_exactly(result + row * run, length, to + row * width * channels);
+    }
+    void write_from(Index r, Index count, const T* results) const {
         Index x = r % grid_width, y = r / grid_width % grid_height, i = r / grid_width / grid_height;
-        const Index run = stride * channels;
-        for (; count > 0; count--) {
-            T* to = image + ((i * height + y * stride) * width + x * stride) * channels;
-            const Index length = least(width - x * stride, stride) * channels, rows = least(height - y * stride, stride);
-            for (Index row = 0; row < rows; row++) copy_exactly(results + row * run, length, to + row * width * channels);
-            results += stride * run;
+        for (; count > 0; count--, results += stride * stride * channels) {
+            write(i, y, x, results);
             if (++x == grid_width) {
                 x = 0;
                 if (++y == grid_height) y = 0, i++;
@@ -143,6 +159,7 @@ struct Pixels {
     }
 };
 
+constexpr Index MOST_STEPS = 512;    // of a window
 constexpr Index BLOCK = 384 * 1024;  // numbers of windows laid out at a time: half of a core's cache
 
 // Windows as the left operand, bfloat16 row after row, float32 as parts on tiles.
@@ -198,7 +215,103 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                 store_sums(sums[turn % 2]);
             }
             write(panels * all - 1, 0, PANEL);
-            if (pixels) pixels->write(r, count, results);
+            if (pixels) pixels->write_from(r, count, results);
+        }
+    }
+}
+
+// The same to pixels, where a window's lines are whole steps. The rows of a panel are 32 images' windows at one place: what is
+// outside of one is outside of all, and is left out.
+template <class T>
+struct Place {
+    Index image, y, x, steps;
+    const Windows<T>* windows;
+    Index which[MOST_STEPS];  // of the weights' steps
+
+    void start(const Windows<T>& its, Index at) {
+        windows = &its;
+        x = at % its.grid_width, y = at / its.grid_width % its.grid_height, image = at / its.grid_width / its.grid_height * PANEL;
+        const Index pixel = its.channels / DEPTH;
+        steps = 0;
+        for (Index row = first_row(); row < last_row(); row++)
+            for (Index s = (row * its.kernel_width + first_column()) * pixel; s < (row * its.kernel_width + last_column()) * pixel; s++)
+                which[steps++] = s;
+    }
+    Index first_row() const { return most(windows->top - y, 0); }
+    Index last_row() const { return least(windows->height + windows->top - y, windows->kernel_height); }
+    Index first_column() const { return most(windows->left - x, 0); }
+    Index last_column() const { return least(windows->width + windows->left - x, windows->kernel_width); }
+
+    void read(Index count, T* out, Index apart) const {
+        const Index run = most(last_column() - first_column(), 0) * windows->channels;
+        for (Index j = 0; j < count; j++, out += apart) {
+            T* to = out;
+            for (Index row = first_row(); row < last_row(); row++, to += run) {
+                const Index line = (image + j) * windows->height + y + row - windows->top;
+                copy(windows->image + (line * windows->width + x + first_column() - windows->left) * windows->channels, run, to);
+            }
+        }
+    }
+};
+
+static inline void lay_out_place(const Place<BF16>& place, Index count, Index stride, BF16*, uint16_t* out) {
+    place.read(count, (BF16*)out, stride);
+}
+static inline void lay_out_place(const Place<float>& place, Index count, Index stride, float* rows, uint16_t* out) {
+    place.read(count, rows, stride);
+    lay_out_left(rows, stride, count, place.steps * DEPTH, out);
+}
+
+template <class T>
+static void places_by_weights(const Windows<T>& windows, Index images, const uint16_t* weights, Index outputs, Behind<T> behind,
+                              const Pixels<T>& pixels, int threads) {
+    const Index steps = steps_of(windows.depth()), stride = (steps | 1) * DEPTH, panel = steps * 2 * PARTS<T> * NUMBERS;
+    const Index laid = PANEL * stride * PARTS<T>, panels = (outputs + PANEL - 1) / PANEL, at_once = most(least(BLOCK / laid, 8), 1);
+    const Index places = (images + PANEL - 1) / PANEL * windows.grid_height * windows.grid_width, blocks = (places + at_once - 1) / at_once;
+#pragma omp parallel num_threads(least(threads, blocks))
+    {
+        static thread_local Scratch scratch;
+        const Index laid_bytes = (at_once * laid + DEPTH) * sizeof(uint16_t), row_bytes = (PANEL * stride + DEPTH) * sizeof(T);
+        char* memory = (char*)scratch.get(laid_bytes + row_bytes + at_once * PANEL * outputs * sizeof(T));
+        uint16_t* operand = (uint16_t*)memory;
+        T* lines = (T*)(memory + laid_bytes);
+        T* results = (T*)(memory + laid_bytes + row_bytes);
+        alignas(64) float sums[2][4 * TILE * TILE] = {};
+        Place<T> here[8];
+        Behind<T> its = behind;
+        its.out = results;
+        Tiles tiles;
+#pragma omp for schedule(static)
+        for (Index block = 0; block < blocks; block++) {
+            const Index all = least(places - block * at_once, at_once);
+            for (Index b = 0; b < all; b++) {
+                here[b].start(windows, block * at_once + b);
+                lay_out_place(here[b], least(images - here[b].image, PANEL), stride, lines, operand + b * laid);
+            }
+            const auto write = [&](Index turn, Index begin, Index end) {
+                const Index p = turn / all, b = turn % all;
+                its(sums[turn % 2], b * PANEL, p * PANEL, begin, least(end, PANEL), least(outputs - p * PANEL, PANEL));
+            };
+            for (Index turn = 0; turn < panels * all; turn++) {
+                const Index p = turn / all, b = turn % all, count = here[b].steps, share = (PANEL + count) / most(count, 1);
+                const Left left = laid_out(operand + b * laid, stride, (T*)nullptr);
+                zero_sums();
+                for (Index i = 0; i < count; i++) {
+                    const Index s = turn % 2 ? count - 1 - i : i;
+                    const uint16_t* right = weights + p * panel + here[b].which[s] * 2 * PARTS<T> * NUMBERS;
+                    if (outputs - p * PANEL > TILE)
+                        add_step<PARTS<T>>(left, s * left.step, right);
+                    else
+                        add_some_step<PARTS<T>, 2, 1>(left, s * left.step, right);
+                    if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
+                }
+                if (turn > 0 && count == 0) write(turn - 1, 0, PANEL);
+                store_sums(sums[turn % 2]);
+            }
+            write(panels * all - 1, 0, PANEL);
+            for (Index b = 0; b < all; b++)
+                for (Index j = 0; j < least(images - here[b].image, PANEL); j++)
+                    pixels.write(here[b].image + j, here[b].y, here[b].x, results + (b * PANEL + j) * outputs);
         }
     }
 }
@@ -252,7 +365,11 @@ static Windows<T> windows_of(const Index* shape, const T* image) {
         const Behind<T> behind{bias, nullptr, 0, (bool)elu, out, outputs};                                             \
         const Index step = shape[11];                                                                                  \
         const Pixels<T> pixels{out, out_height, out_width, outputs / most(step * step, 1), step, windows.grid_height, windows.grid_width}; \
-        windows_by_weights(windows, shape[0] * grid, weights, outputs, behind, step ? &pixels : nullptr, threads);     \
+        if (step && windows.stride == 1 && windows.top + windows.left > 0 && windows.channels % DEPTH == 0 &&         \
+            windows.depth() <= MOST_STEPS * DEPTH)                                                                     \
+            places_by_weights(windows, shape[0], weights, outputs, behind, pixels, threads);                           \
+        else                                                                                                           \
+            windows_by_weights(windows, shape[0] * grid, weights, outputs, behind, step ? &pixels : nullptr, threads); \
     }                                                                                                                  \
     EXPORT void arrange_weights_##NAME(const float* weight, Index narrow, Index wide, Index height, Index width, Index stride, T* out, \
                                        int threads) {                                                                  \

@@ -77,16 +77,37 @@ static inline void transpose(__m512i x[16]) {
 
 static inline __mmask32 first(Index count) { return count >= 32 ? ~0u : count <= 0 ? 0 : (1u << count) - 1; }
 
-// 32 numbers of a row, those outside of the mask 0, as parts.
-static inline void row(const BF16* p, __mmask32 mask, __m512i parts[]) { parts[0] = _mm512_maskz_loadu_epi16(mask, p); }
-static inline void row(const float* p, __mmask32 mask, __m512i parts[]) {
-    __m512 low = _mm512_maskz_loadu_ps(mask, p), high = _mm512_maskz_loadu_ps(mask >> 16, p + 16);
+// 32 numbers as parts.
+static inline void split(__m512 low, __m512 high, __m512i parts[]) {
     for (int i = 0; i < 3; i++) {
         __m512i part = (__m512i)_mm512_cvtne2ps_pbh(high, low);
         parts[i] = part;
         low -= (__m512)_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_castsi512_si256(part)), 16);
         high -= (__m512)_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(part, 1)), 16);
     }
+}
+
+// 32 numbers of a row, those outside of the mask 0, as parts.
+static inline void row(const BF16* p, __mmask32 mask, __m512i parts[]) { parts[0] = _mm512_maskz_loadu_epi16(mask, p); }
+static inline void row(const float* p, __mmask32 mask, __m512i parts[]) {
+    split(_mm512_maskz_loadu_ps(mask, p), _mm512_maskz_loadu_ps(mask >> 16, p + 16), parts);
+}
+
+// The same from several places: `masks` says which numbers come from which.
+template <class Start>
+static inline void row(const BF16* p, const Start& starts, const __mmask32* masks, int count, __m512i parts[]) {
+    __m512i x = _mm512_setzero_si512();
+    for (int i = 0; i < count; i++) x = _mm512_mask_loadu_epi16(x, masks[i], p + starts[i]);
+    parts[0] = x;
+}
+template <class Start>
+static inline void row(const float* p, const Start& starts, const __mmask32* masks, int count, __m512i parts[]) {
+    __m512 low = _mm512_setzero_ps(), high = low;
+    for (int i = 0; i < count; i++) {
+        low = _mm512_mask_loadu_ps(low, masks[i], p + starts[i]);
+        high = _mm512_mask_loadu_ps(high, masks[i] >> 16, p + starts[i] + 16);
+    }
+    split(low, high, parts);
 }
 
 // Two rows of 32 numbers as pairs: those of the first 16 columns, and those of the others.
@@ -124,15 +145,18 @@ static inline void store_two(BF16* p, Two x, __mmask32 mask) {
 
 enum Side { LEFT, RIGHT };
 
-// Two tiles of x (depth, across), next to each other; `at` tells where its rows are.
-template <Side side, class T, class Rows>
-static inline void lay_tiles_by_rows(Rows at, Index across, Index depth, uint16_t* out) {
-    __m512i p[PARTS<T>], q[PARTS<T>], tiles[PARTS<T>][2][TILE];
-    const __mmask32 mask = first(across);
+// Two tiles of a matrix (depth, across), next to each other; `read` gives the parts of row j. `whole`: 32 rows.
+template <Side side, class T, bool whole, class Read>
+static inline void lay_tiles(Read read, Index depth, uint16_t* out) {
+    __m512i p[PARTS<T>] = {}, q[PARTS<T>] = {}, tiles[PARTS<T>][2][TILE];
     for (Index j = 0; j < TILE; j++) {
-        row(at(2 * j), 2 * j < depth ? mask : 0, p);
-        row(at(2 * j + 1), 2 * j + 1 < depth ? mask : 0, q);
-        for (int i = 0; i < PARTS<T>; i++) interleave(p[i], q[i], tiles[i][0][j], tiles[i][1][j]);
+        if (whole || 2 * j < depth) read(2 * j, p);
+        if (whole || 2 * j + 1 < depth) read(2 * j + 1, q);
+        for (int i = 0; i < PARTS<T>; i++) {
+            if (!whole && 2 * j >= depth) p[i] = _mm512_setzero_si512();
+            if (!whole && 2 * j + 1 >= depth) q[i] = _mm512_setzero_si512();
+            interleave(p[i], q[i], tiles[i][0][j], tiles[i][1][j]);
+        }
     }
     for (int i = 0; i < PARTS<T>; i++) {
         for (int half = 0; half < 2; half++, out += NUMBERS) {
@@ -141,9 +165,17 @@ static inline void lay_tiles_by_rows(Rows at, Index across, Index depth, uint16_
         }
     }
 }
+template <Side side, class T, class Read>
+static inline void lay_tiles(Read read, Index depth, uint16_t* out) {
+    if (depth >= DEPTH)
+        lay_tiles<side, T, true>(read, depth, out);
+    else
+        lay_tiles<side, T, false>(read, depth, out);
+}
 template <Side side, class T>
 static inline void lay_tiles_by_depth(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
-    lay_tiles_by_rows<side, T>([=](Index j) { return x + j * stride; }, across, depth, out);
+    const __mmask32 mask = first(across);
+    lay_tiles<side, T>([=](Index j, __m512i* parts) { row(x + j * stride, mask, parts); }, depth, out);
 }
 
 // One tile of x (across, depth), as the right operand.

@@ -19,7 +19,8 @@ struct PlainRows {
     }
     // Columns from c on of up to 32 of these rows.
     void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
-        lay_tiles_by_rows<RIGHT, T>([=](Index j) { return rows[j] + c; }, columns, count, out);
+        const __mmask32 mask = first(columns);
+        lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j] + c, mask, parts); }, count, out);
     }
 };
 
@@ -30,7 +31,7 @@ struct Piece {
     Index left_stride, m;
     const Right* right;
     Index begin, count, c, columns;
-    const T* rows[ROWS + DEPTH];
+    const T* rows[ROWS];
     uint16_t *laid_left, *laid_right;
     Index step = 0, across = 0;
     bool at_right = false;
@@ -39,7 +40,6 @@ struct Piece {
         begin = its_begin, count = its_count, c = its_c, columns = its_columns;
         step = across = 0, at_right = false;
         right->find(begin, count, rows);
-        for (Index i = count; i < up_to(count, DEPTH); i++) rows[i] = rows[0];
     }
     Index pieces() const { return steps_of(count) * (up_to(m, PANEL) + up_to(columns, PANEL)) / PANEL; }
     void lay_out_one() {
