@@ -64,7 +64,6 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
 // -- the gradient of weights ------------------------------------------------------------------------------------------
 
 #define FOR(T, NAME)                                                                                                   \
-    EXPORT Index laid_size_##NAME(Index across, Index depth) { return laid_size<T>(across, depth); }                   \
     EXPORT void lay_out_weights_##NAME(const T* weight, Index stride, Index outputs, Index depth, int by_depth, uint16_t* out, \
                                        int threads) {                                                                  \
         lay_out_weights(weight, stride, outputs, depth, by_depth, out, threads);                                       \
@@ -76,16 +75,15 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
 FOR(float, float)
 FOR(BF16, bfloat16)
 
-#define PRODUCT(T, OUT, NAME)                                                                                          \
+#define PRODUCT(T, NAME)                                                                                          \
     EXPORT void rows_by_weights_##NAME(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights,      \
-                                       Index outputs, const float* bias, const OUT* plus, Index plus_stride, int elu,  \
-                                       OUT* out, Index out_stride, int threads) {                                      \
-        Behind<OUT> behind{bias, plus, plus_stride, (bool)elu, out, out_stride};                                       \
+                                       Index outputs, const float* bias, const T* plus, Index plus_stride, int elu,  \
+                                       T* out, Index out_stride, int threads) {                                      \
+        Behind<T> behind{bias, plus, plus_stride, (bool)elu, out, out_stride};                                       \
         rows_by_weights(x, stride, rows, depth, weights, outputs, behind, threads);                                    \
     }
-PRODUCT(float, float, float)
-PRODUCT(BF16, BF16, bfloat16)
-PRODUCT(BF16, float, bfloat16_to_float)
+PRODUCT(float, float)
+PRODUCT(BF16, bfloat16)
 
 #else
 
