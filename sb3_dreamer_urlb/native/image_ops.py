@@ -10,17 +10,17 @@ import ctypes
 from collections.abc import Sequence
 
 import torch as th
+import torch.nn.functional as F
 
 from sb3_dreamer_urlb.native import ops, product_ops
 
 _POINTER, _INDEX, _INT = ops._POINTER, ops._INDEX, ops._INT
 
+_BY_WEIGHTS = (*(_POINTER, _POINTER, _POINTER, _INDEX, _POINTER), *(_INT, _POINTER, _INDEX, _INDEX, _INT))
 ops.OPTIONAL["has_tiles"].update(
     {
-        "windows_by_weights_": (
-            *(_POINTER, _POINTER, _POINTER, _INDEX, _POINTER),
-            *(_INT, _POINTER, _INDEX, _INDEX, _INT),
-        ),
+        "windows_by_weights_": _BY_WEIGHTS,
+        "lines_by_weights": _BY_WEIGHTS,
         "arrange_weights_": (_POINTER, _INDEX, _INDEX, _INDEX, _INDEX, _INDEX, _POINTER, _INT),
         "transposed_by_windows_": (_POINTER, _POINTER, _POINTER, _INDEX, _POINTER, _POINTER, _INT),
     }
@@ -43,13 +43,15 @@ def gather(wide: th.Tensor, weight: th.Tensor, stride: int, bias: th.Tensor | No
     :param elu: whether ELU follows
     :return: (N, n, …) in wide's format
     """
-    function = ops._of_format("windows_by_weights_", wide)
     n, channels, *kernel = weight.shape
     _check_image(wide, channels)
     _check_bias(bias, n)
     grid = _grid(wide, kernel, stride)
     narrow = wide.new_empty(len(wide), *grid, n).permute(0, 3, 1, 2)
-    laid = product_ops.lay_out_weights(_arranged(weight, wide.dtype, 0), False)
+    arranged, function = _arranged(weight, wide.dtype, 0), ops._of_format("windows_by_weights_", wide)
+    if _by_lines(wide, grid):
+        arranged, function = _whole_steps(arranged.unflatten(1, (kernel[0], -1))).flatten(1), ops._function("lines_by_weights")
+    laid = product_ops.lay_out_weights(arranged, False)
     if narrow.numel():
         function(
             *(_shape(wide, kernel, stride, grid, (0, 0), 0), wide.data_ptr(), laid.data_ptr(), n),
@@ -72,7 +74,6 @@ def scatter(
     :param elu: whether ELU follows
     :return: (N, w, *size) in narrow's format
     """
-    function = ops._of_format("windows_by_weights_", narrow)
     n, channels, *kernel = weight.shape
     _check_image(narrow, n)
     _check_bias(bias, channels)
@@ -80,7 +81,11 @@ def scatter(
     grid = [-(-side // stride) for side in size]
     bias = None if bias is None else bias.repeat(stride**2)
     wide = narrow.new_empty(len(narrow), *size, channels).permute(0, 3, 1, 2)
-    laid = product_ops.lay_out_weights(_arranged(weight, narrow.dtype, stride), True)
+    arranged, function = _arranged(weight, narrow.dtype, stride), ops._of_format("windows_by_weights_", narrow)
+    if _by_lines(narrow, grid):
+        arranged = _whole_steps(arranged.unflatten(0, (few[0], -1)).mT).mT.flatten(0, 1).contiguous()
+        function = ops._function("lines_by_weights")
+    laid = product_ops.lay_out_weights(arranged, True)
     if wide.numel():
         shape = _shape(narrow, few, 1, grid, (few[0] - 1, few[1] - 1), stride)
         function(
@@ -127,6 +132,16 @@ def _arranged(weight: th.Tensor, dtype: th.dtype, stride: int) -> th.Tensor:
     function = ops._of_format("arrange_weights_", arranged)
     function(weight.data_ptr(), n, channels, height, width, stride, arranged.data_ptr(), th.get_num_threads())
     return arranged
+
+
+def _by_lines(image: th.Tensor, grid: Sequence[int]) -> bool:
+    """Whether lines of the grid nearly fill panels, and pixels are too small for the other way."""
+    return image.dtype == th.bfloat16 and image.shape[1] % 32 > 0 and 4 * grid[1] >= 3 * product_ops._up(grid[1])
+
+
+def _whole_steps(weight: th.Tensor) -> th.Tensor:
+    """Zeros behind the last dimension up to a multiple of 32."""
+    return F.pad(weight, (0, -weight.shape[-1] % product_ops.PANEL))
 
 
 def _grid(wide: th.Tensor, kernel: Sequence[int], stride: int) -> list[int]:
