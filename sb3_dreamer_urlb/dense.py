@@ -73,7 +73,7 @@ class _Layer(Function):
 
     @staticmethod
     def forward(ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, elu: bool) -> th.Tensor:
-        x, weight = (part if part.stride(-1) == 1 else part.contiguous() for part in (x, weight))
+        x, weight = (part if product_ops.rows_fit(part) else part.contiguous() for part in (x, weight))
         weight = weight.to(x.dtype)
         y: th.Tensor = product_ops.rows_by_weights(x, product_ops.lay_out_weights(weight, False), len(weight), bias, None, elu)
         wants_weight = ctx.needs_input_grad[1]  # type: ignore[attr-defined]

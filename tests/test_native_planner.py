@@ -311,6 +311,17 @@ def test_same_states_and_scores(agent, threads):
                 assert a.shape == (2, N * M) and th.allclose(a, b, atol=1e-4), ask
 
 
+def test_heads_without_hidden_layers(world_model):
+    """Whose only layer reads states and what else there is, and gives the result."""
+    its = Agent(world_model(net_arch=[]), [], None)
+    state, action, scores = _start(its.world_model.rssm, 0), th.rand(N * M, 2), []
+    with th.no_grad(), deterministic_draws():
+        for ready in (PlannedAgent(its, th.zeros(1, 0)), *(_prepared(its, th.zeros(1, 0), dtype) for dtype in FORMATS)):
+            features = ready.features([ready.step(state, action, None)])
+            scores.append(th.stack([ready.rewards(features), ready.values(features)]))
+    assert th.allclose(scores[0], scores[1], atol=1e-5) and th.allclose(scores[0], scores[2], atol=0.05)
+
+
 def test_same_plan_of_the_same_random_numbers(agent):
     """The plain form draws with one uniform number a variable in the same order."""
     planner = DynaMPC(PlannerConfig(horizon=3, n_samples=40, iterations=3, top_k=5), 0.95)

@@ -7,10 +7,10 @@
 #ifdef HAS_TILES
 
 // What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
-template <class Out>
+template <class Out, class Plus = Out>
 struct Behind {
     const float* bias;
-    const Out* plus;
+    const Plus* plus;
     Index plus_stride;
     bool elu;
     Out* out;
@@ -26,7 +26,7 @@ struct Behind {
 
     template <bool some>
     void write(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
-        const Out *its_plus = plus ? plus + r * plus_stride + c : nullptr;
+        const Plus* its_plus = plus ? plus + r * plus_stride + c : nullptr;
         Out* its_out = out + (r + begin) * out_stride + c;
         const bool its_elu = elu;
         const __mmask32 mask = first(columns);
@@ -45,9 +45,9 @@ struct Behind {
 };
 
 // 32 rows of the left operand (fewer at the end) · weights laid out. What follows one panel is done while the next is multiplied.
-template <class T, class Out>
+template <class T, class Following>
 static inline void block_by_weights(const Left& left, const uint16_t* weights, Index steps, Index outputs, Index r, Index height,
-                                    const Behind<Out>& behind) {
+                                    const Following& behind) {
     alignas(64) float sums[2][4 * TILE * TILE];
     const Index panels = (outputs + PANEL - 1) / PANEL, share = (height + steps - 1) / steps;
     for (Index p = 0; p < panels; p++) {

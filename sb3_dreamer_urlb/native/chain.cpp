@@ -41,16 +41,17 @@ static void chain(const T* x, Index stride, Index rows, const T* plus, Index plu
             for (Index l = 0; l < count; l++) {
                 const ChainLayer& layer = layers[l];
                 const Index steps = steps_of(layer.depth);
+                const T* its_plus = l == 0 ? plus : nullptr;
                 if (l + 1 == count) {
-                    const Behind<Out> behind{layer.bias, nullptr, 0, false, out, layer.outputs};
+                    const Behind<Out, T> behind{layer.bias, its_plus, plus_stride, false, out, layer.outputs};
                     block_by_weights<T>(left, layer.weights, steps, layer.outputs, r, height, behind);
                     break;
                 }
                 T* its = numbers + l % 2 * room;
                 const Index width = up_to(layer.outputs, PANEL);
-                const T* its_plus = l == 0 && plus ? plus + r * plus_stride : nullptr;
+                const T* these = its_plus ? its_plus + r * plus_stride : nullptr;
                 block_by_weights<T>(left, layer.weights, steps, layer.outputs, 0, height,
-                                    Behind<T>{layer.bias, its_plus, plus_stride, true, its, width});
+                                    Behind<T>{layer.bias, these, plus_stride, true, its, width});
                 // What stands behind a row meets weights of 0, but must be a number.
                 for (Index i = 0; i < height; i++) std::memset(its + i * width + layer.outputs, 0, (width - layer.outputs) * sizeof(T));
                 left = left_of(its, width, height, layer.outputs, laid);

@@ -64,7 +64,7 @@ def rows_by_weights(
 ) -> th.Tensor:
     """x · weightᵀ + bias + plus, then ELU.
 
-    :param x: float32 or bfloat16 (n, inputs), rows contiguous
+    :param x: float32 or bfloat16 (n, inputs), at least one, rows contiguous
     :param laid: what :func:`lay_out_weights` gave for weights of the same format
     :param outputs: of the weights
     :param bias: float32 (outputs,), None for none
@@ -74,6 +74,7 @@ def rows_by_weights(
     """
     function = ops._of_format("rows_by_weights_", x)
     _check_rows(x)
+    _check_inputs(x)
     rows, inputs = x.shape
     if laid.numel() != _up(outputs) * _up(inputs) * (3 if x.dtype == th.float32 else 1):
         raise ValueError(f"these weights were not laid out for {ops._describe(x)} and {outputs} outputs.")
@@ -85,11 +86,12 @@ def rows_by_weights(
             raise ValueError(f"to {rows} rows of {outputs} outputs one cannot add {ops._describe(plus)}.")
         plus_row = plus.stride(0)
     y = x.new_empty(rows, outputs)
-    function(
-        *(x.data_ptr(), x.stride(0), rows, inputs, laid.data_ptr(), outputs),
-        *(None if bias is None else bias.data_ptr(), None if plus is None else plus.data_ptr(), plus_row),
-        *(elu, y.data_ptr(), outputs, th.get_num_threads()),
-    )
+    if y.numel():
+        function(
+            *(x.data_ptr(), x.stride(0), rows, inputs, laid.data_ptr(), outputs),
+            *(None if bias is None else bias.data_ptr(), None if plus is None else plus.data_ptr(), plus_row),
+            *(elu, y.data_ptr(), outputs, th.get_num_threads()),
+        )
     return y
 
 
@@ -97,7 +99,7 @@ def rows_by_weights(
 def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: list[th.Tensor], short: bool) -> th.Tensor:
     """Layers one after the other, with ELU behind all but the last one.
 
-    :param x: float32 or bfloat16 (n, inputs), rows contiguous
+    :param x: float32 or bfloat16 (n, inputs), at least one, rows contiguous
     :param plus: added to what the first layer gives, before ELU, (n, outputs of the first layer), in x's format; None for none
     :param laid: what :func:`lay_out_weights` gave for the weights of each layer, of x's format
     :param biases: float32 (outputs,) of each layer
@@ -106,6 +108,7 @@ def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: l
     """
     function = ops._function("chain_short") if short and x.dtype == th.bfloat16 else ops._of_format("chain_", x)
     _check_rows(x)
+    _check_inputs(x)
     rows, depth = x.shape
     numbers: list[int] = []
     for weights, bias in zip(laid, biases, strict=True):
@@ -122,7 +125,7 @@ def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: l
             raise ValueError(f"to {rows} rows of {len(biases[0])} outputs one cannot add {ops._describe(plus)}.")
         plus_row = plus.stride(0)
     y = x.new_empty(rows, depth, dtype=x.dtype if short else th.float32)
-    if rows:
+    if y.numel():
         layers = (ctypes.c_int64 * len(numbers))(*numbers)
         place = None if plus is None else plus.data_ptr()
         function(x.data_ptr(), x.stride(0), rows, place, plus_row, layers, len(laid), y.data_ptr(), th.get_num_threads())
@@ -144,7 +147,7 @@ def transposed_product(left: th.Tensor, right: th.Tensor) -> th.Tensor:
         raise ValueError(f"the transpose of {ops._describe(left)} cannot be multiplied with {ops._describe(right)}.")
     threads, m, n = th.get_num_threads(), left.shape[1], right.shape[1]
     out = th.empty(m, n) if len(left) else th.zeros(m, n)
-    if len(left):
+    if len(left) and out.numel():
         sums = th.empty(threads * _up(m) * _up(n))
         function(
             *(left.data_ptr(), left.stride(0), right.data_ptr(), right.stride(0), sums.data_ptr(), out.data_ptr()),
@@ -157,6 +160,17 @@ def _up(size: int) -> int:
     return -(-size // PANEL) * PANEL
 
 
+def rows_fit(x: th.Tensor) -> bool:
+    """Whether a row's numbers lie next to each other, and rows do not overlap. The stride of a dimension of one is any."""
+    (rows, columns), (down, across) = x.shape, x.stride()
+    return (columns < 2 or across == 1) and (rows < 2 or down >= columns)
+
+
 def _check_rows(x: th.Tensor) -> None:
-    if x.dim() != 2 or x.stride(1) != 1 or x.stride(0) < x.shape[1]:
+    if x.dim() != 2 or not rows_fit(x):
         raise ValueError(f"rows must be contiguous, got {ops._describe(x)}.")
+
+
+def _check_inputs(x: th.Tensor) -> None:
+    if x.shape[1] == 0:
+        raise ValueError(f"there are no inputs in {ops._describe(x)}.")

@@ -31,12 +31,12 @@ static void lay_out_weights(const T* weight, Index stride, Index outputs, Index 
     }
 }
 
-// Whole rows that begin with a line of the cache can be read as they are. What stands behind them, up to a step, meets weights
-// of 0; it belongs to the same memory, because the next row begins with a line, too.
-static inline bool fits(const BF16* x, Index stride, Index rows) {
-    return rows >= PANEL && stride % DEPTH == 0 && (uintptr_t)x % 64 == 0;
+// Rows of whole steps that begin with a line of the cache can be read as they are. What stood behind others, up to a step, would
+// meet weights of 0, which makes nothing of a number, but NaN of what is none.
+static inline bool fits(const BF16* x, Index stride, Index rows, Index depth) {
+    return rows >= PANEL && depth % DEPTH == 0 && stride % DEPTH == 0 && (uintptr_t)x % 64 == 0;
 }
-static inline bool fits(const float*, Index, Index) { return false; }
+static inline bool fits(const float*, Index, Index, Index) { return false; }
 
 static inline Left as_it_is(const BF16* x, Index stride) { return Left(x, stride); }
 static inline Left as_it_is(const float* x, Index) { return Left((const uint16_t*)x, 3); }  // never
@@ -53,7 +53,7 @@ static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, c
 #pragma omp for schedule(static)
         for (Index block = 0; block < blocks; block++) {
             const Index r = block * PANEL, height = least(rows - r, PANEL);
-            const bool as_is = fits(x, stride, height);
+            const bool as_is = fits(x, stride, height, depth);
             if (!as_is) lay_out_left(x + r * stride, stride, height, depth, laid);
             const Left left = as_is ? as_it_is(x + r * stride, stride) : Left(laid, PARTS<T>);
             block_by_weights<T>(left, weights, steps, outputs, r, height, behind);
