@@ -12,10 +12,11 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from hypothesis import settings
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, activation, distributions, native
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.native import build, planner_ops, product_ops
 from sb3_dreamer_urlb.types import Posterior, SequenceBatch
 from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
@@ -106,6 +107,23 @@ def batch(seeded: None) -> SequenceBatch:
     is_terminal[0, -1] = True
     observation = th.randint(0, 256, (*lead, *IMAGE), dtype=th.uint8)
     return SequenceBatch(observation, th.rand(*lead, ACTIONS) * 2 - 1, th.rand(lead), is_first, is_terminal)
+
+
+@pytest.fixture
+def kernels_of_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inside ``native.using()``, kernels of our own for tiny tensors, too, and on processors where torch's are faster."""
+    try:
+        build.find_compiler()
+    except build.NativeUnavailable as error:
+        pytest.skip(str(error))
+    assert native.why_not() is None
+    monkeypatch.setattr(activation, "SMALLEST_NATIVE", 0)
+    monkeypatch.setattr(activation, "SMALLEST_NATIVE_LEARNING", 0)
+    monkeypatch.setattr(activation, "SMALLEST_NATIVE_GRADIENT", {th.float32: 0, th.bfloat16: 0})
+    monkeypatch.setattr(distributions, "NATIVE_SIZE", 0)
+    monkeypatch.setattr(product_ops, "ROWS", 1)
+    monkeypatch.setattr(product_ops, "COLUMNS", 1)
+    monkeypatch.setattr(planner_ops, "fast", lambda: True)
 
 
 def infer(model: WorldModel, batch: SequenceBatch) -> Posterior:

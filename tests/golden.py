@@ -20,7 +20,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb import distributions, native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
@@ -128,9 +128,10 @@ class Case:
     """One golden file and the agent that it describes.
 
     :param path: of the ``.npz``
+    :param compile: whose kernels the learner uses
     """
 
-    def __init__(self, path: str):
+    def __init__(self, path: str, compile: str = "eager"):
         with np.load(path) as archive:
             self.data = {name: archive[name] for name in archive.files}
         self.config = json.loads(bytes(self.data["config"]).decode())
@@ -138,7 +139,7 @@ class Case:
         if self.config["agent"] not in METHODS:
             raise ValueError(f"{path}: method {self.config['agent']!r} is not one of {sorted(METHODS)}")
         self.agent = self._make_agent()
-        self.learner = Learner(self.agent, self._learner_config())
+        self.learner = Learner(self.agent, self._learner_config(compile))
         self._load_weights()
 
     def _make_agent(self) -> Agent:
@@ -165,7 +166,7 @@ class Case:
         agent.reward_normalizer.momentum = self.config["reward_norm"]["momentum"]
         return agent
 
-    def _learner_config(self) -> LearnerConfig:
+    def _learner_config(self, compile: str) -> LearnerConfig:
         config = self.config
         return LearnerConfig(
             learning_rate=config["model_lr"],
@@ -181,6 +182,7 @@ class Case:
             target_update_interval=config["slow_target_update"],
             ent_coef=config["actor_ent"],
             reward_trains_model="reward" in config["grad_heads"],
+            compile=compile,
         )
 
     def parameter(self, name: str) -> th.Tensor:
@@ -350,15 +352,16 @@ def check_planner(case: Case, worst: Worst, seen_as: Callable[[Agent, th.Tensor]
         action = given["action"].unsqueeze(0)
 
 
-def check(path: str) -> Worst:
+def check(path: str, compile: str = "eager") -> Worst:
     """Run every comparison that the file holds.
 
     :param path: of the ``.npz``
+    :param compile: whose kernels run, ``"eager"`` for torch's
     :return: the worst errors
     """
     worst = Worst()
-    case = Case(path)
-    with deterministic_draws():
+    case = Case(path, compile)
+    with deterministic_draws(), native.using(compile, "cpu"):
         check_forward(case, worst)
         check_updates(case, worst)
         if "plan0.mean" in case.data:
