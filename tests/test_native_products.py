@@ -217,6 +217,18 @@ def test_what_is_not_a_number_stays_in_its_row(inputs, layout, dtype, bad):
     assert found[[3, inputs - 1]].isfinite().sum() == 0 and found[4 : inputs - 1].isfinite().all()
 
 
+@pytest.mark.parametrize("dtype", FORMATS)
+def test_chains_leave_nothing_behind(dtype):
+    """A thread keeps the memory between layers: what is no number there meets the next chain's weights of 0."""
+    found = []
+    for width in (45, 64, 45):
+        weights = [_numbers(n, m, dtype=dtype, seed=n) for m, n in ((40, width), (width, 7))]
+        laid = [product_ops.lay_out_weights(weight, False) for weight in weights]
+        x = _numbers(70, 40, dtype=dtype) if width == 45 else th.full((70, 40), math.nan, dtype=dtype)
+        found.append(product_ops.chain(x, None, laid, [th.zeros(width), th.zeros(7)], False))
+    assert found[0].isfinite().all() and found[1].isnan().all() and th.equal(found[0], found[2])
+
+
 # -- nothing, and misuse ---------------------------------------------------------------------------------------------------
 
 

@@ -38,6 +38,9 @@ SMALL_SIDE = {th.float32: 5, th.bfloat16: 4}
 #: The same for products with one pass as phases: the third convolution and the second transposed one in bfloat16.
 MIDDLE_SIDE = {th.float32: 0, th.bfloat16: 6}
 
+#: Channels of either image below which tiles, three products for one, are not worth it in float32.
+CHANNELS = 16
+
 
 def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     """``layer(x)``, while learning on a CPU in the form that is fastest there.
@@ -78,6 +81,8 @@ def convolves_on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> b
     if not native.active() or x.device.type != "cpu" or not th.is_grad_enabled():
         return False
     if _dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
+        return False
+    if _dtype(x) == th.float32 and min(layer.weight.shape[:2]) < CHANNELS:
         return False
     narrow = x.shape[-2:]
     if isinstance(layer, nn.Conv2d):
