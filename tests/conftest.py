@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.native import build, planner_ops, product_ops
 from sb3_dreamer_urlb.types import Posterior, SequenceBatch
-from sb3_dreamer_urlb.world_model import convolution
+from sb3_dreamer_urlb.world_model import convolution, gru
 from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
@@ -125,6 +125,7 @@ def kernels_of_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(product_ops, "ROWS", 1)
     monkeypatch.setattr(product_ops, "COLUMNS", 1)
     monkeypatch.setattr(convolution, "CHANNELS", 1)
+    monkeypatch.setattr(gru, "NATIVE_ROWS", 1)
     monkeypatch.setattr(planner_ops, "fast", lambda: True)
 
 
