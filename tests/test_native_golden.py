@@ -14,7 +14,7 @@ from sb3_dreamer_urlb.native import product_ops
 #: what runs: on every processor, with tiles, and what a plan adds to both
 LEARNING = {"scale_images", "bias_elu_", "elu_backward", "squared_distance", "softmax_backward", "gates", "gates_backward"}
 PRODUCTS = {"lay_out_weights", "rows_by_weights", "transposed_product", "image_gather", "image_scatter", "image_weight"}
-PLANNING, CHAINS = {"gather", "recurrence"}, {"chain"}
+PLANNING, CHAINS = {"gather"}, {"chain"}
 #: largest error of a metric, and its size from which on that is meant relatively
 ERROR = {"float32": 3e-5, "bfloat16": 0.04}
 SMALLEST = 0.03

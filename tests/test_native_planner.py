@@ -219,15 +219,15 @@ def test_rows_that_are_no_numbers_stay_so():
 
 @settings(deadline=None, max_examples=40)
 @given(n=st.integers(0, 40), size=st.one_of(st.integers(1, 70), st.just(200)), dtype=st.sampled_from(FORMATS))
-def test_recurrence(n, size, dtype):
+def test_gates(n, size, dtype):
     parts, weight, bias, old = (
         _numbers(*shape, seed=seed) for seed, shape in enumerate([(n, 3 * size), (3 * size,), (3 * size,), (n, size)])
     )
     parts = (3 * parts + 5).to(dtype)
     room = th.full((n, size + 3), 7.0, dtype=dtype)
-    new = planner_ops.recurrence(parts, weight, bias, 1e-5, old, room[:, 2:-1])
-    reset, update, candidate = F.layer_norm(parts.double(), (3 * size,), weight.double(), bias.double()).chunk(3, -1)
-    exact = th.lerp(old.double(), (reset.sigmoid() * candidate).tanh(), update.sigmoid())
+    new = planner_ops.gates(parts, weight, bias, 1e-5, old, room[:, 2:-1])
+    reset, candidate, update = F.layer_norm(parts.double(), (3 * size,), weight.double(), bias.double()).chunk(3, -1)
+    exact = th.lerp(old.double(), (reset.sigmoid() * candidate).tanh(), (update - 1).sigmoid())
     assert new.dtype == th.float32 and th.allclose(new.double(), exact, atol=2e-5)
     assert th.equal(room[:, 2:-1], new.to(dtype)) and (room[:, :2] == 7).all() and (room[:, -1] == 7).all()
 
@@ -237,9 +237,9 @@ def test_gates_far_out_and_what_is_not_a_number():
     parts[0, :48], parts[0, 48:] = 1e30, -1e30
     parts[1, 5] = math.nan
     old = _numbers(3, 32)
-    new = planner_ops.recurrence(parts, th.full((96,), 1e4), th.zeros(96), 1e-5, old, th.empty(3, 32))
+    new = planner_ops.gates(parts, th.full((96,), 1e4), th.zeros(96), 1e-5, old, th.empty(3, 32))
     assert new[0].isfinite().all() and new[1].isnan().all()
-    assert th.allclose(new[2], old[2] / 2)
+    assert th.allclose(new[2], old[2] * (1 - th.sigmoid(th.tensor(-1.0))))
 
 
 # -- misuse ----------------------------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def test_what_kernels_do_not_take():
         "other inputs must be": lambda: planner_ops.gather(rows, None, rows, th.zeros(2, 3), None, None, False, out),
         "an addend must be": lambda: planner_ops.gather(rows, classes, None, None, None, th.zeros(5), False, out),
         "a result must be": lambda: planner_ops.gather(rows, classes, None, None, None, None, False, out.bfloat16()),
-        "parts must be": lambda: planner_ops.recurrence(out, out, out, 1e-5, out, out),
+        "parts must be": lambda: planner_ops.gates(out, out, out, 1e-5, out, out),
     }.items():
         with pytest.raises(ValueError, match=words):
             call()

@@ -24,10 +24,9 @@ ops.ARGUMENTS.update(
         "draws_": (*[_POINTER] * 5, *[_INDEX] * 4, _INT),
         "gather_": GATHER,
         "gather_half": GATHER,
-        "gates_": (_POINTER, _POINTER, _POINTER, _FLOAT, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
+        "gates_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
         "gates_backward_": (*[_POINTER] * 4, _FLOAT, *[_POINTER] * 3, _INDEX, _INDEX, _INT),
         "softmax_backward_": (_POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
-        "recurrence_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
     }
 )
 
@@ -165,49 +164,30 @@ def gather(
     )
 
 
-@ops.operator("recurrence(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old, Tensor(a!) short) -> Tensor")
-def recurrence(
-    parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor, short: th.Tensor
+@ops.operator("gates(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old, Tensor(a!)? short) -> Tensor")
+def gates(
+    parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor, short: th.Tensor | None
 ) -> th.Tensor:
     """What the GRU of the RSSM does behind its product.
 
-    :param parts: reset, update and candidate, before their norm, float32 or bfloat16 (n, 3D), contiguous
+    :param parts: reset, candidate and update, before their norm, float32 or bfloat16 (n, 3D), contiguous
     :param weight: of the norm over all of them, float32 (3D,)
-    :param bias: likewise; with the −1 that makes a GRU forget slowly
+    :param bias: likewise
     :param epsilon: of the norm
     :param old: the state before, float32 (n, D), contiguous
-    :param short: takes the new state, in the format of ``parts``, (n, D), its rows contiguous
+    :param short: takes the new state, too, in the format of ``parts``, (n, D), its rows contiguous; None: nothing does
     :return: the new state, float32 (n, D)
     :raises TypeError: for another format
     :raises ValueError: for another layout or size
     """
-    function = ops._of_format("recurrence_", parts)
-    n, size = old.shape
-    _check("parts", parts, parts.dtype, (n, 3 * size))
-    _check("a norm's weight", weight, th.float32, (3 * size,))
-    _check("a norm's bias", bias, th.float32, (3 * size,))
-    _check("the state before", old, th.float32, (n, size))
-    _check_rows("the state's copy", short, parts.dtype, (n, size))
-    new = th.empty_like(old)
-    places = [tensor.data_ptr() for tensor in (parts, weight, bias)]
-    function(
-        *(*places, epsilon, old.data_ptr(), new.data_ptr(), short.data_ptr(), short.stride(0)),
-        *(n, size, th.get_num_threads()),
-    )
-    return new
-
-
-@ops.operator("gates(Tensor parts, Tensor weight, Tensor bias, float epsilon, Tensor old) -> Tensor")
-def gates(parts: th.Tensor, weight: th.Tensor, bias: th.Tensor, epsilon: float, old: th.Tensor) -> th.Tensor:
-    """:func:`recurrence` with parts as a learning RSSM has them: reset, candidate, update, and no −1 in the bias.
-
-    :return: the new state, float32 (n, D)
-    """
     function = ops._of_format("gates_", parts)
     n, size = _check_gates(parts, weight, bias, old)
+    if short is not None:
+        _check_rows("the state's copy", short, parts.dtype, (n, size))
     new = th.empty_like(old)
     places = [tensor.data_ptr() for tensor in (parts, weight, bias)]
-    function(*places, epsilon, old.data_ptr(), new.data_ptr(), n, size, th.get_num_threads())
+    copy = (None, 0) if short is None else (short.data_ptr(), short.stride(0))
+    function(*places, epsilon, old.data_ptr(), new.data_ptr(), *copy, n, size, th.get_num_threads())
     return new
 
 

@@ -12,7 +12,7 @@ from sb3_dreamer_urlb.native import planner_ops
 from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.planning.chain import Chain
-from sb3_dreamer_urlb.planning.prepared_parts import SampledState, in_order_of_use
+from sb3_dreamer_urlb.planning.prepared_parts import SampledState
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
@@ -57,8 +57,7 @@ class NativeDynamics:
         self.rows = whole_lines(rssm.input.weight[:, : rssm.stoch_size].T, rows_dtype)
         self.action_rows = whole_lines(rssm.input.weight[:, rssm.stoch_size :].T, rows_dtype)
         self.bias = whole_lines(rssm.input.bias, rows_dtype)
-        (gru_weight, gru_bias), self.norm = in_order_of_use(rssm)
-        self.gru = Chain([gru_weight], [gru_bias], dtype)
+        self.gru, self.norm = Chain([rssm.gru.weight], [rssm.gru.bias], dtype), (rssm.gru_norm.weight, rssm.gru_norm.bias)
         self.epsilon = rssm.gru_norm.eps
         hidden, logits = rssm.prior_hidden, rssm.prior_logits
         self.logits = Chain([hidden.weight, logits.weight], [hidden.bias, logits.bias], dtype)
@@ -73,7 +72,7 @@ class NativeDynamics:
             before, inputs = state.classes, state.inputs
         planner_ops.gather(self.rows, before, self.action_rows, action, self.bias, addend, True, inputs[:, : self.hidden_size])
         next_inputs, short = self._inputs(inputs)
-        deter = planner_ops.recurrence(self.gru(inputs, short=True), *self.norm, self.epsilon, state.deter, short)
+        deter = planner_ops.gates(self.gru(inputs, short=True), *self.norm, self.epsilon, state.deter, short)
         logits = self.logits(short, short=True).view(-1, *self.shape)
         classes = distributions.draw_classes_of_logits(logits, generator)
         return SampledState(classes, deter, short, self.stoch_size, next_inputs)

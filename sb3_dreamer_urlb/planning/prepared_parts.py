@@ -102,8 +102,7 @@ class Dynamics:
         self.dtype, self.shape, self.stoch_size = dtype, rssm.logits_shape, rssm.stoch_size
         self.rows = rssm.stoch_rows().to(dtype)
         self.action = PrepackedLinear(rssm.input.weight[:, rssm.stoch_size :], rssm.input.bias, dtype)
-        gru, self.norm = in_order_of_use(rssm)
-        self.gru = PrepackedLinear(*gru, dtype)
+        self.gru, self.norm = _in_order_of_use(rssm, dtype)
         self.hidden = PrepackedLinear(rssm.prior_hidden.weight, rssm.prior_hidden.bias, dtype)
         # A constant for each variable changes no probability: logits whose mean is 0 need no search for their largest.
         weight = rssm.prior_logits.weight.view(*self.shape, -1)
@@ -146,9 +145,8 @@ class Dynamics:
         return th.cat(drawn, 1).add_(self.first_class)
 
 
-def in_order_of_use(rssm: RSSM) -> tuple[tuple[th.Tensor, th.Tensor], tuple[th.Tensor, th.Tensor]]:
-    """Weight and bias of the GRU's layer and of its norm, in the order reset, update, candidate; the update
-    gate's own bias is in the norm's."""
+def _in_order_of_use(rssm: RSSM, dtype: th.dtype) -> tuple[PrepackedLinear, tuple[th.Tensor, th.Tensor]]:
+    """The GRU's layer and its norm with the parts (reset, update, candidate), and the bias of the update gate within."""
 
     def ordered(parameter: th.Tensor) -> th.Tensor:
         reset, candidate, update = parameter.chunk(3)
@@ -156,4 +154,5 @@ def in_order_of_use(rssm: RSSM) -> tuple[tuple[th.Tensor, th.Tensor], tuple[th.T
 
     norm_bias = ordered(rssm.gru_norm.bias)
     norm_bias[rssm.deter_size : 2 * rssm.deter_size] -= 1
-    return (ordered(rssm.gru.weight), ordered(rssm.gru.bias)), (ordered(rssm.gru_norm.weight), norm_bias)
+    gru = PrepackedLinear(ordered(rssm.gru.weight), ordered(rssm.gru.bias), dtype)
+    return gru, (ordered(rssm.gru_norm.weight), norm_bias)

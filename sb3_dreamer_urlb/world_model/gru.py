@@ -42,7 +42,7 @@ class _Gates(Function):
         old = old.contiguous()
         ctx.save_for_backward(parts, weight, bias, old)
         ctx.epsilon = epsilon  # type: ignore[attr-defined]
-        new: th.Tensor = planner_ops.gates(parts, weight, bias, epsilon, old)
+        new: th.Tensor = planner_ops.gates(parts, weight, bias, epsilon, old, None)
         return new
 
     @staticmethod
