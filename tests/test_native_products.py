@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import math
+import subprocess
 from contextlib import contextmanager
 
 import pytest
@@ -13,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from test_native import kernels  # noqa: F401 (fixture)
 
-from sb3_dreamer_urlb.native import product_ops
+from sb3_dreamer_urlb.native import build, product_ops
 
 FORMATS = [th.float32, th.bfloat16]
 #: what float32 sums of float32 products may be off, relative to the sum of magnitudes
@@ -324,8 +326,43 @@ def test_what_the_others_do_not_take():
 # -- tiles of others -------------------------------------------------------------------------------------------------------
 
 
-def test_others_find_their_tiles_as_they_left_them():
-    """oneDNN's products, which use tiles for bfloat16, before, between and behind ours."""
+SHAPES = """
+#include <cstring>
+#include <immintrin.h>
+alignas(64) static unsigned char shapes[64], found[64];
+extern "C" void set() {
+    shapes[0] = 1, shapes[16] = 8, shapes[48] = 3, shapes[18] = 20, shapes[49] = 5;  // palette; bytes and rows of two tiles
+    _tile_loadconfig(shapes);
+}
+extern "C" int kept() {
+    _tile_storeconfig(found);
+    _tile_release();
+    return std::memcmp(shapes, found, 64) == 0;
+}
+"""
+
+
+def test_others_find_their_tiles_as_they_left_them(tmp_path):
+    """Somebody in this thread shaped tiles, as oneDNN does for more than one product."""
+    (tmp_path / "shapes.cpp").write_text(SHAPES)
+    flags = ["-march=native", "-shared", "-fPIC", "-o", str(tmp_path / "shapes.so")]
+    subprocess.run([*build.find_compiler(), *flags, str(tmp_path / "shapes.cpp")], check=True)
+    its = ctypes.CDLL(str(tmp_path / "shapes.so"))
+    x, weight = _numbers(64, 40), _numbers(50, 40)
+    laid = product_ops.lay_out_weights(weight, False)
+    with _threads(1):
+        for call in (
+            lambda: product_ops.rows_by_weights(x, laid, 50, None, None, False),
+            lambda: product_ops.chain(x, None, [laid], [th.zeros(50)], False),
+            lambda: product_ops.transposed_product(x, x),
+        ):
+            its.set()
+            call()
+            assert its.kept()
+
+
+def test_products_of_others_in_between():
+    """oneDNN's, which use tiles for bfloat16, before, between and behind ours."""
     x, weight = _numbers(300, 96, dtype=th.bfloat16), _numbers(70, 96, dtype=th.bfloat16, seed=1)
     odd, narrow = _numbers(37, 53, dtype=th.bfloat16), _numbers(11, 53, dtype=th.bfloat16, seed=1)
     exact, other = x.double() @ weight.double().T, odd.double() @ narrow.double().T
