@@ -21,7 +21,7 @@ import torch as th
 from gymnasium import spaces
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, native
 
 
 class NoiseImages(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -49,6 +49,9 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--preset", default="paper", help="size of the model (default: paper)")
     options.add_argument("--precision", nargs="+", default=["float32", "bfloat16"], help="formats of products to compare")
+    options.add_argument(
+        "--compile", nargs="+", default=["auto"], help="whose kernels, to compare: auto, native, eager (default: auto)"
+    )
     options.add_argument(
         "--repeat", type=int, default=3, help="timed repetitions, after one that is not (default: %(default)s)"
     )
@@ -91,6 +94,7 @@ CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 def make_model(options: argparse.Namespace, **kwargs: Any) -> DreamerV2:
     """A fresh model on noise images."""
     set_threads(options)
+    kwargs.setdefault("compile", options.compile[0])
     return DreamerV2("CnnPolicy", NoiseImages(), preset=options.preset, device=options.device, seed=0, **kwargs)
 
 
@@ -177,6 +181,7 @@ def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]
         "load": round(os.getloadavg()[0], 1),
         "threads": th.get_num_threads(),
         "clock": options.clock,
+        "kernels": native.describe(getattr(options, "compile", ["auto"])[0], device),
         "python": platform.python_version(),
         **{package: found for package in PACKAGES if (found := _version(package))},
         **({"preset": options.preset} if options.preset else {}),

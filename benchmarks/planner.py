@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import numpy as np
 import torch as th
@@ -23,9 +24,12 @@ def main() -> None:
     images = np.random.default_rng(0).integers(0, 256, (10, 64, 64, 3), np.uint8)
     work: dict[str, Callable[[], object]] = {}
     floors = {}
-    for precision in options.precision:
-        model = make_model(options, precision=precision, planner="dyna_mpc", learning_starts=0, planner_delay=0)
-        one, ten = (f"Dyna-MPC, {environments}, {precision}" for environments in ("1 environment", "10 environments"))
+    for precision, compile in product(options.precision, options.compile):
+        model = make_model(
+            options, precision=precision, planner="dyna_mpc", learning_starts=0, planner_delay=0, compile=compile
+        )
+        kind = ", ".join([precision, *([compile] if len(options.compile) > 1 else [])])
+        one, ten = (f"Dyna-MPC, {environments}, {kind}" for environments in ("1 environment", "10 environments"))
         work[one] = partial(model.predict, images[:1])
         work[ten] = partial(model.predict, images)
         if options.preset == "paper":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report
@@ -42,19 +43,19 @@ def main() -> None:
     options = choice.parse_args()
     work: dict[str, Callable[[], object]] = {}
     floors = {}
-    for precision in options.precision:
+    for precision, compile in product(options.precision, options.compile):
         for phase in options.phases:
-            model = make_model(options, precision=precision, intrinsic_reward=PHASES[phase])
+            model = make_model(options, precision=precision, intrinsic_reward=PHASES[phase], compile=compile)
             model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
             learner, batch = model.learner, model.replay_buffer.sample(model.batch_size)
-            row = f"{phase}, {precision}"
+            row = ", ".join([phase, precision, *([compile] if len(options.compile) > 1 else [])])
             work[row] = partial(learner.update, batch)
             if options.parts:
                 work.update({f"{row}, {part}": half for part, half in parts(learner, batch).items()})
-            product = f"product of 4096³ in {str(learner.dtype).removeprefix('torch.')}"
-            work.setdefault(product, Product(learner.dtype, model.device))
+            floor = f"product of 4096³ in {str(learner.dtype).removeprefix('torch.')}"
+            work.setdefault(floor, Product(learner.dtype, model.device))
             if options.preset == "paper":
-                floors[row] = Floor(product, TFLOP / Product.TFLOP, TARGETS.get(precision))
+                floors[row] = Floor(floor, TFLOP / Product.TFLOP, TARGETS.get(precision))
     report("update", interleaved(work, options, model.device), floors, options, model.device)
 
 
