@@ -16,6 +16,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 # Before any CDLL: torch's wheel brings its own OpenMP, and the library shall use that one's threads.
@@ -24,7 +25,7 @@ import torch  # noqa: F401
 FOLDER = Path(__file__).parent
 COMPILERS = ("c++", "g++", "clang++")
 # No -ffast-math: what is not a number must stay so.
-FLAGS = ("-O3", "-march=native", "-fopenmp", "-shared", "-fPIC", "-fvisibility=hidden", "-std=c++17")
+FLAGS = ("-O3", "-march=native", "-fopenmp", "-fPIC", "-fvisibility=hidden", "-std=c++17")
 #: seconds that the compiler may take
 TIME_LIMIT = 120.0
 
@@ -103,10 +104,15 @@ def _fingerprint(compiler: list[str]) -> str:
 
 
 def _compile(compiler: list[str], file: Path) -> None:
-    sources = sorted(str(path) for path in FOLDER.glob("*.cpp"))
+    """Each source for itself, all at the same time, into the folder of the library."""
+    sources = sorted(FOLDER.glob("*.cpp"))
     if not sources:
         raise NativeUnavailable(f"no C++ source in {FOLDER}")
-    _run([*compiler, *FLAGS, "-o", str(file), *sources])
+    objects = [str(file.with_name(f"{source.stem}.o")) for source in sources]
+    commands = [[*compiler, *FLAGS, "-c", "-o", *pair] for pair in zip(objects, map(str, sources), strict=True)]
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(_run, commands))
+    _run([*compiler, *FLAGS, "-shared", "-o", str(file), *objects])
 
 
 def _run(command: list[str]) -> bytes:
