@@ -84,7 +84,8 @@ def test_passes_of_a_convolution(tiles, threads, shape, dtype):  # noqa: F811
 @pytest.mark.parametrize("elu", [False, True])
 @pytest.mark.parametrize("kind", [nn.Conv2d, nn.ConvTranspose2d])
 @pytest.mark.parametrize(("kernel", "size"), [(4, (14, 14)), (5, (7, 7)), ((3, 2), (9, 6))], ids=str)
-def test_layers_on_tiles(tiles, seeded, kind, kernel, size, elu, dtype):
+def test_layers_on_tiles(tiles, seeded, monkeypatch, kind, kernel, size, elu, dtype):
+    monkeypatch.setattr(convolution, "CHANNELS", 1)
     ours = kind(6, 10, kernel, 2)
     theirs = copy.deepcopy(ours)
     x = th.randn(80, 6, *size)
@@ -215,3 +216,13 @@ def test_world_models_learn_the_same(kernels, learner, batch, precision):  # noq
             found.append([float(its.update(batch)["image_loss"]) for _ in range(3)])
         assert (calls.counts["sb3_dreamer_urlb.squared_distance.default"] == 3) == (compile == "native")
     assert found[0] == pytest.approx(found[1], rel=1e-5 if precision == "float32" else 1e-3)
+
+
+def test_few_channels_in_float32_are_left_to_torch(tiles):
+    x = th.randn(80, 16, 14, 14)
+    for channels, ours in {convolution.CHANNELS - 1: False, convolution.CHANNELS: True}.items():
+        layer = nn.Conv2d(16, channels, 4, 2)
+        with native.using("native", "cpu"):
+            assert convolution.convolves_on_tiles(layer, x) == ours
+            with th.autocast("cpu"):
+                assert convolution.convolves_on_tiles(layer, x)
