@@ -113,7 +113,8 @@ class _Sample(Function):
     def forward(ctx: FunctionCtx, logits: th.Tensor, generator: th.Generator | None) -> th.Tensor:
         classes, probs = draw_classes_and_probs(logits, generator)
         ctx.save_for_backward(probs)
-        return one_hot_like(logits, classes)
+        drawn: th.Tensor = planner_ops.one_hot(classes, logits)
+        return drawn
 
     @staticmethod
     @once_differentiable

@@ -12,7 +12,8 @@ from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.native import product_ops
 
 #: what runs: on every processor, with tiles, and what a plan adds to both
-LEARNING = {"scale_images", "bias_elu_", "elu_backward", "squared_distance", "softmax_backward", "gates", "gates_backward"}
+LEARNING = {"scale_images", "bias_elu_", "elu_backward", "squared_distance"}
+LEARNING |= {"one_hot", "softmax_backward", "gates", "gates_backward"}
 PRODUCTS = {"lay_out_weights", "rows_by_weights", "transposed_product", "image_gather", "image_scatter", "image_weight"}
 PLANNING, CHAINS = {"gather"}, {"chain"}
 #: largest error of a metric, and its size from which on that is meant relatively

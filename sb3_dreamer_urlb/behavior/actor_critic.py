@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch as th
+import torch.nn.functional as F
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
@@ -37,8 +38,10 @@ class Actor(nn.Module):
     def forward(self, feature: th.Tensor, skill: th.Tensor | None = None) -> BoundedNormal:
         """(…, F) and the skill followed there, (…, W), → distribution over (…, A)."""
         hidden = self.body.hidden(_with_skill(feature, skill))
-        std = 2 * th.sigmoid(full(self.out_std(hidden)) / 2) + MIN_STD
-        return BoundedNormal(th.tanh(full(self.body.out(hidden))), std)
+        # Both outputs are one product.
+        weight, bias = (th.cat(pair) for pair in zip(self.body.out.parameters(), self.out_std.parameters(), strict=True))
+        mean, std = full(F.linear(hidden, weight, bias)).chunk(2, -1)
+        return BoundedNormal(th.tanh(mean), 2 * th.sigmoid(std / 2) + MIN_STD)
 
 
 class CategoricalActor(MLP):

@@ -142,6 +142,23 @@ static void draws(const T* logits, const float* bias, const float* uniform, Inde
 FOR(float, float)
 FOR(BF16, bfloat16)
 
+// out (rows, size) ← 1 at each row's class, 0 elsewhere.
+template <class T>
+static void one_hot(const Index* classes, T* out, T one, Index rows, Index size, int threads) {
+#pragma omp parallel for num_threads(threads) if (rows * size > WORTH_A_THREAD) schedule(static)
+    for (Index r = 0; r < rows; r++) {
+        std::memset(out + r * size, 0, size * sizeof(T));
+        out[r * size + classes[r]] = one;
+    }
+}
+
+EXPORT void one_hot_float(const Index* classes, float* out, Index rows, Index size, int threads) {
+    one_hot(classes, out, 1.0f, rows, size, threads);
+}
+EXPORT void one_hot_bfloat16(const Index* classes, BF16* out, Index rows, Index size, int threads) {
+    one_hot(classes, out, BF16{0x3f80}, rows, size, threads);
+}
+
 // out ← probs · (grad - the mean of grad under probs), each row of `size` for itself: the gradient of a softmax.
 template <class T>
 static void softmax_backward(const T* grad, const float* probs, T* out, Index rows, Index size, int threads) {

@@ -26,6 +26,7 @@ ops.ARGUMENTS.update(
         "gather_half": GATHER,
         "gates_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
         "gates_backward_": (*[_POINTER] * 4, _FLOAT, *[_POINTER] * 3, _INDEX, _INDEX, _INT),
+        "one_hot_": (_POINTER, _POINTER, _INDEX, _INDEX, _INT),
         "softmax_backward_": (_POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
     }
 )
@@ -76,6 +77,21 @@ def rows_format(dtype: th.dtype) -> th.dtype:
     """Of rows whose sums are asked for in ``dtype``: float16 in place of bfloat16 where the processor adds such numbers, twice
     as fast and more exactly, as long as weights stay below 16 000."""
     return th.float16 if dtype == th.bfloat16 and ops._function("has_halves")() else dtype
+
+
+@ops.operator("one_hot(Tensor classes, Tensor like) -> Tensor")
+def one_hot(classes: th.Tensor, like: th.Tensor) -> th.Tensor:
+    """
+    :param classes: int64 (…), contiguous and below K, which is not checked
+    :param like: float32 or bfloat16 (…, K)
+    :return: one-hot vectors in the shape and format of ``like``
+    """
+    function = ops._of_format("one_hot_", like)
+    _check("classes", classes, th.int64, tuple(like.shape[:-1]))
+    out = like.new_empty(like.shape)
+    if out.numel():
+        function(classes.data_ptr(), out.data_ptr(), classes.numel(), like.shape[-1], th.get_num_threads())
+    return out
 
 
 @ops.operator("softmax_backward(Tensor grad, Tensor probs) -> Tensor")
