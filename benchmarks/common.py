@@ -181,7 +181,7 @@ def machine(options: argparse.Namespace, device: th.device) -> dict[str, object]
         "load": round(os.getloadavg()[0], 1),
         "threads": th.get_num_threads(),
         "clock": options.clock,
-        "kernels": native.describe(getattr(options, "compile", ["auto"])[0], device),
+        "kernels": " and ".join(native.describe(compile, device) for compile in getattr(options, "compile", ["auto"])),
         "python": platform.python_version(),
         **{package: found for package in PACKAGES if (found := _version(package))},
         **({"preset": options.preset} if options.preset else {}),

@@ -135,7 +135,7 @@ def _run(command: list[str]) -> bytes:
                 raise NativeUnavailable(f"{shlex.join(command)} took more than {TIME_LIMIT:g} s") from error
             raise
     if process.returncode != 0:
-        words = errors.decode(errors="replace").strip()[-1000:]
+        words = errors.decode(errors="replace").strip()[-1000:] or "it said nothing"
         raise NativeUnavailable(f"{shlex.join(command)} failed with exit code {process.returncode}:\n{words}")
     return output
 
