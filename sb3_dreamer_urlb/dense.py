@@ -16,6 +16,7 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.native import ops, product_ops
+from sb3_dreamer_urlb.precision import product_dtype
 
 #: rows and inputs from which on laying an operand out pays
 ROWS, INPUTS = 1024, 1024
@@ -50,20 +51,15 @@ def column_sums(x: th.Tensor) -> th.Tensor:
     return x.sum(0) if x.dtype != th.bfloat16 or x.shape[1] < 16 else (x.new_ones(1, len(x)) @ x).squeeze(0)
 
 
-def _dtype(x: th.Tensor) -> th.dtype:
-    """The format of a product with x."""
-    return th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
-
-
 def _on_tiles(x: th.Tensor, weight: th.Tensor) -> bool:
-    if not native.active() or x.device.type != "cpu" or _dtype(x) not in ops.FORMATS:
+    if not native.active() or x.device.type != "cpu" or product_dtype(x) not in ops.FORMATS:
         return False
     return product_ops.worthwhile(x.shape[:-1].numel(), x.shape[-1], len(weight))
 
 
 def _layer(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, elu: bool) -> th.Tensor:
     # Outside of the function, so that autograd brings x's gradient back.
-    rows = x.to(_dtype(x)).flatten(0, -2)
+    rows = x.to(product_dtype(x)).flatten(0, -2)
     y: th.Tensor = _Layer.apply(rows, weight, bias, elu)  # type: ignore[no-untyped-call]
     return y.view(*x.shape[:-1], -1)
 

@@ -39,12 +39,17 @@ def products(device: th.device | str, dtype: th.dtype) -> th.autocast:
     return th.autocast(th.device(device).type, th.bfloat16, enabled=dtype == th.bfloat16)
 
 
-def short(x: th.Tensor) -> th.Tensor:
-    """In the format of products here and now, as :func:`products` set it; gradients come back in x's own."""
+def product_dtype(x: th.Tensor) -> th.dtype:
+    """The format of a product with x here and now: as :func:`products` set it, else x's own."""
     device = x.device.type
     if not th.amp.is_autocast_available(device) or not th.is_autocast_enabled(device):
-        return x
-    return x.to(th.get_autocast_dtype(device))
+        return x.dtype
+    return th.get_autocast_dtype(device)
+
+
+def short(x: th.Tensor) -> th.Tensor:
+    """In the format of products here and now; gradients come back in x's own."""
+    return x.to(product_dtype(x))
 
 
 def full(x: th.Tensor) -> th.Tensor:

@@ -12,6 +12,7 @@ from sb3_dreamer_urlb.behavior.actor_critic import SuccessorCritic
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.planning.native_parts import NativeDynamics, NativeHead
 from sb3_dreamer_urlb.planning.prepared_parts import Dynamics, Head, SampledState, Visited
+from sb3_dreamer_urlb.precision import product_dtype
 from sb3_dreamer_urlb.types import LatentState
 
 #: states scored at once: what a processor's cache holds
@@ -83,4 +84,4 @@ def planned(agent: Agent, skill: th.Tensor) -> PlannedAgent:
     """
     if skill.device.type != "cpu":
         return PlannedAgent(agent, skill)
-    return PreparedAgent(agent, skill, th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else th.float32)
+    return PreparedAgent(agent, skill, product_dtype(skill))

@@ -30,6 +30,7 @@ from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.dense import column_sums
 from sb3_dreamer_urlb.native import image_ops, ops
+from sb3_dreamer_urlb.precision import product_dtype
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
@@ -50,7 +51,7 @@ def convolve(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tensor:
     """
     if x.device.type != "cpu" or not th.is_grad_enabled():
         return layer(x)
-    dtype = _dtype(x)
+    dtype = product_dtype(x)
     if convolves_on_tiles(layer, x):
         return _tiles(layer, x, False)
     form = _form(layer, x, dtype)
@@ -71,18 +72,13 @@ def convolve_elu(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> th.Tens
     return elu_(convolve(layer, x))
 
 
-def _dtype(x: th.Tensor) -> th.dtype:
-    """The format of a convolution of x."""
-    return th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else x.dtype
-
-
 def convolves_on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> bool:
     """Whether kernels of our own do it; parameters as those of :func:`convolve`."""
     if not native.active() or x.device.type != "cpu" or not th.is_grad_enabled():
         return False
-    if _dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
+    if product_dtype(x) not in ops.FORMATS or layer.bias is None or layer.stride[0] != layer.stride[1]:
         return False
-    if _dtype(x) == th.float32 and min(layer.weight.shape[:2]) < CHANNELS:
+    if product_dtype(x) == th.float32 and min(layer.weight.shape[:2]) < CHANNELS:
         return False
     narrow = x.shape[-2:]
     if isinstance(layer, nn.Conv2d):
@@ -92,7 +88,7 @@ def convolves_on_tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor) -> b
 
 def _tiles(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, elu: bool) -> th.Tensor:
     # Outside of the function, so that autograd brings x's gradient back.
-    x, transposed = x.to(_dtype(x)), isinstance(layer, nn.ConvTranspose2d)
+    x, transposed = x.to(product_dtype(x)), isinstance(layer, nn.ConvTranspose2d)
     # A single pixel meets the whole kernel at once.
     kernel = layer.kernel_size
     stride = kernel[0] if transposed and x.shape[-2:] == (1, 1) and kernel[0] == kernel[1] else layer.stride[0]
