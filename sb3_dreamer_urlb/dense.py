@@ -71,7 +71,7 @@ class _Layer(Function):
     def forward(ctx: FunctionCtx, x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, elu: bool) -> th.Tensor:
         x, weight = (part if product_ops.rows_fit(part) else part.contiguous() for part in (x, weight))
         weight = weight.to(x.dtype)
-        y: th.Tensor = product_ops.rows_by_weights(x, product_ops.lay_out_weights(weight, False), len(weight), bias, None, elu)
+        y: th.Tensor = product_ops.rows_by_weights(x, product_ops.lay_out_weights(weight, False), len(weight), bias, elu)
         wants_weight = ctx.needs_input_grad[1]  # type: ignore[attr-defined]
         # torch takes None for "nothing to keep", its types do not.
         ctx.save_for_backward(x if wants_weight else None, weight, y if elu else None)  # type: ignore[arg-type]
@@ -89,9 +89,8 @@ class _Layer(Function):
             grad = grad.contiguous()
             bias_grad = column_sums(grad).float() if wants_bias else None
         if wants_x:
-            x_grad = product_ops.rows_by_weights(
-                grad, product_ops.lay_out_weights(weight, True), weight.shape[1], None, None, False
-            )
+            laid = product_ops.lay_out_weights(weight, True)
+            x_grad = product_ops.rows_by_weights(grad, laid, weight.shape[1], None, False)
         if wants_weight:
             weight_grad = product_ops.transposed_product(grad, x)
         return x_grad, weight_grad, bias_grad if wants_bias else None, None

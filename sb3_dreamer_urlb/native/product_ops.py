@@ -20,10 +20,7 @@ ROWS, COLUMNS = 256, 32
 
 ops.OPTIONAL["has_tiles"] = {
     "lay_out_weights_": (_POINTER, _INDEX, _INDEX, _INDEX, _INT, _POINTER, _INT),
-    "rows_by_weights_": (
-        *(_POINTER, _INDEX, _INDEX, _INDEX, _POINTER, _INDEX),
-        *(_POINTER, _POINTER, _INDEX, _INT, _POINTER, _INDEX, _INT),
-    ),
+    "rows_by_weights_": (_POINTER, _INDEX, _INDEX, _INDEX, _POINTER, _INDEX, _POINTER, _INT, _POINTER, _INDEX, _INT),
     "chain_": (_POINTER, _INDEX, _INDEX, _POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _INT),
     "chain_short": (_POINTER, _INDEX, _INDEX, _POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _INT),
     "transposed_product_": (_POINTER, _INDEX, _POINTER, _INDEX, _POINTER, _POINTER, _INDEX, _INDEX, _INDEX, _INT),
@@ -58,17 +55,14 @@ def lay_out_weights(weight: th.Tensor, transposed: bool) -> th.Tensor:
     return laid
 
 
-@ops.operator("rows_by_weights(Tensor x, Tensor laid, int outputs, Tensor? bias, Tensor? plus, bool elu) -> Tensor")
-def rows_by_weights(
-    x: th.Tensor, laid: th.Tensor, outputs: int, bias: th.Tensor | None, plus: th.Tensor | None, elu: bool
-) -> th.Tensor:
-    """x · weightᵀ + bias + plus, then ELU.
+@ops.operator("rows_by_weights(Tensor x, Tensor laid, int outputs, Tensor? bias, bool elu) -> Tensor")
+def rows_by_weights(x: th.Tensor, laid: th.Tensor, outputs: int, bias: th.Tensor | None, elu: bool) -> th.Tensor:
+    """x · weightᵀ + bias, then ELU.
 
     :param x: float32 or bfloat16 (n, inputs), at least one, rows contiguous
     :param laid: what :func:`lay_out_weights` gave for weights of the same format
     :param outputs: of the weights
     :param bias: float32 (outputs,), None for none
-    :param plus: (n, outputs) in x's format, None for none
     :param elu: whether ELU follows
     :return: (n, outputs) in x's format
     """
@@ -80,17 +74,11 @@ def rows_by_weights(
         raise ValueError(f"these weights were not laid out for {ops._describe(x)} and {outputs} outputs.")
     if bias is not None and (bias.dtype != th.float32 or bias.shape != (outputs,) or not bias.is_contiguous()):
         raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")
-    plus_row = 0
-    if plus is not None:
-        if plus.dtype != x.dtype or plus.shape != (rows, outputs) or plus.stride(1) != 1:
-            raise ValueError(f"to {rows} rows of {outputs} outputs one cannot add {ops._describe(plus)}.")
-        plus_row = plus.stride(0)
     y = x.new_empty(rows, outputs)
     if y.numel():
         function(
             *(x.data_ptr(), x.stride(0), rows, inputs, laid.data_ptr(), outputs),
-            *(None if bias is None else bias.data_ptr(), None if plus is None else plus.data_ptr(), plus_row),
-            *(elu, y.data_ptr(), outputs, th.get_num_threads()),
+            *(None if bias is None else bias.data_ptr(), elu, y.data_ptr(), outputs, th.get_num_threads()),
         )
     return y
 

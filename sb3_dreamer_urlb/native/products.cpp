@@ -77,9 +77,8 @@ FOR(BF16, bfloat16)
 
 #define PRODUCT(T, NAME)                                                                                          \
     EXPORT void rows_by_weights_##NAME(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights,      \
-                                       Index outputs, const float* bias, const T* plus, Index plus_stride, int elu,  \
-                                       T* out, Index out_stride, int threads) {                                      \
-        Behind<T> behind{bias, plus, plus_stride, (bool)elu, out, out_stride};                                       \
+                                       Index outputs, const float* bias, int elu, T* out, Index out_stride, int threads) { \
+        Behind<T> behind{bias, nullptr, 0, (bool)elu, out, out_stride};                                              \
         rows_by_weights(x, stride, rows, depth, weights, outputs, behind, threads);                                    \
     }
 PRODUCT(float, float)
