@@ -45,7 +45,7 @@ def gather(wide: th.Tensor, weight: th.Tensor, stride: int, bias: th.Tensor | No
     """
     n, channels, *kernel = weight.shape
     _check_image(wide, channels)
-    _check_bias(bias, n)
+    product_ops._check_bias(bias, n)
     grid = _grid(wide, kernel, stride)
     narrow = wide.new_empty(len(wide), *grid, n).permute(0, 3, 1, 2)
     arranged, function = _arranged(weight, wide.dtype, 0), ops._of_format("windows_by_weights_", wide)
@@ -76,7 +76,7 @@ def scatter(
     """
     n, channels, *kernel = weight.shape
     _check_image(narrow, n)
-    _check_bias(bias, channels)
+    product_ops._check_bias(bias, channels)
     few = [-(-side // stride) for side in kernel]
     grid = [-(-side // stride) for side in size]
     bias = None if bias is None else bias.repeat(stride**2)
@@ -160,8 +160,3 @@ def _shape(
 def _check_image(image: th.Tensor, channels: int) -> None:
     if image.dim() != 4 or image.shape[1] != channels or not image.is_contiguous(memory_format=th.channels_last):
         raise ValueError(f"images must have {channels} channels, last in memory, got {ops._describe(image)}.")
-
-
-def _check_bias(bias: th.Tensor | None, outputs: int) -> None:
-    if bias is not None and (bias.dtype != th.float32 or bias.shape != (outputs,) or not bias.is_contiguous()):
-        raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")

@@ -48,8 +48,7 @@ def lay_out_weights(weight: th.Tensor, transposed: bool) -> th.Tensor:
     function = ops._of_format("lay_out_weights_", weight)
     _check_rows(weight)
     outputs, inputs = weight.shape[::-1] if transposed else weight.shape
-    parts = 3 if weight.dtype == th.float32 else 1
-    laid = th.empty(_up(outputs) * _up(inputs) * parts, dtype=th.int16)
+    laid = th.empty(_laid_size(inputs, outputs, weight.dtype), dtype=th.int16)
     threads = th.get_num_threads()
     function(weight.data_ptr(), weight.stride(0), outputs, inputs, transposed, laid.data_ptr(), threads)
     return laid
@@ -70,10 +69,9 @@ def rows_by_weights(x: th.Tensor, laid: th.Tensor, outputs: int, bias: th.Tensor
     _check_rows(x)
     _check_inputs(x)
     rows, inputs = x.shape
-    if laid.numel() != _up(outputs) * _up(inputs) * (3 if x.dtype == th.float32 else 1):
+    if laid.numel() != _laid_size(inputs, outputs, x.dtype):
         raise ValueError(f"these weights were not laid out for {ops._describe(x)} and {outputs} outputs.")
-    if bias is not None and (bias.dtype != th.float32 or bias.shape != (outputs,) or not bias.is_contiguous()):
-        raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")
+    _check_bias(bias, outputs)
     y = x.new_empty(rows, outputs)
     if y.numel():
         function(
@@ -101,10 +99,9 @@ def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: l
     numbers: list[int] = []
     for weights, bias in zip(laid, biases, strict=True):
         outputs = len(bias)
-        if weights.numel() != _up(outputs) * _up(depth) * (3 if x.dtype == th.float32 else 1):
+        if weights.numel() != _laid_size(depth, outputs, x.dtype):
             raise ValueError(f"these weights were not laid out for {depth} inputs and {outputs} outputs in {x.dtype}.")
-        if bias.dtype != th.float32 or not bias.is_contiguous():
-            raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")
+        _check_bias(bias, outputs)
         numbers += [weights.data_ptr(), bias.data_ptr(), depth, outputs]
         depth = outputs
     plus_row = 0
@@ -148,6 +145,11 @@ def _up(size: int) -> int:
     return -(-size // PANEL) * PANEL
 
 
+def _laid_size(inputs: int, outputs: int, dtype: th.dtype) -> int:
+    """How many numbers :func:`lay_out_weights` gives."""
+    return _up(outputs) * _up(inputs) * (3 if dtype == th.float32 else 1)
+
+
 def rows_fit(x: th.Tensor) -> bool:
     """Whether a row's numbers lie next to each other, and rows do not overlap. The stride of a dimension of one is any."""
     (rows, columns), (down, across) = x.shape, x.stride()
@@ -162,3 +164,8 @@ def _check_rows(x: th.Tensor) -> None:
 def _check_inputs(x: th.Tensor) -> None:
     if x.shape[1] == 0:
         raise ValueError(f"there are no inputs in {ops._describe(x)}.")
+
+
+def _check_bias(bias: th.Tensor | None, outputs: int) -> None:
+    if bias is not None and (bias.dtype != th.float32 or bias.shape != (outputs,) or not bias.is_contiguous()):
+        raise ValueError(f"a bias for {outputs} outputs cannot be {ops._describe(bias)}.")
