@@ -95,7 +95,7 @@ def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> 
     :param generator: source of randomness
     :return: one-hot (…, S, K), in the format of the logits
     """
-    if native.plans() and logits.device.type == "cpu" and logits.numel() >= NATIVE_SIZE:
+    if native.on_lanes() and logits.device.type == "cpu" and logits.numel() >= NATIVE_SIZE:
         drawn: th.Tensor = _Sample.apply(logits.contiguous(), generator)  # type: ignore[no-untyped-call]
         return drawn
     probs = full(logits).softmax(-1)

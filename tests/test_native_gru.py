@@ -31,7 +31,7 @@ def _inputs(rows: int, size: int, dtype: th.dtype) -> tuple[th.Tensor, th.Tensor
 
 @pytest.fixture(autouse=True)
 def lanes(monkeypatch):
-    monkeypatch.setattr(native, "plans", native.active)
+    monkeypatch.setattr(native, "on_lanes", native.active)
     monkeypatch.setattr(gru, "NATIVE_ROWS", 1)
 
 

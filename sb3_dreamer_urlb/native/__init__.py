@@ -78,8 +78,8 @@ def describe(compile: str, device: th.device | str) -> str:
     return "native where they are faster, torch's elsewhere" if reason is None else f"torch's ({reason})"
 
 
-def plans() -> bool:
-    """Whether to plan with kernels of our own, here and now: they need more of a processor than the others."""
+def on_lanes() -> bool:
+    """Whether to use the kernels of ``planner_ops``, here and now: they pay on vectors of sixteen lanes (AVX-512)."""
     return active() and planner_ops.fast()
 
 

@@ -1,4 +1,8 @@
-"""The planner's kernels as torch operators: draws from logits, sums of selected rows of weights, what a GRU does last."""
+"""Kernels that pay on vectors of sixteen lanes (AVX-512), as torch operators: draws from logits with their gradient, sums of
+selected rows of weights, and what a GRU does last with its gradient.
+
+Plans need draws, sums and the GRU, updates everything but the sums.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,7 @@ ops.ARGUMENTS.update(
 
 
 def fast() -> bool:
-    """Whether they are made for this processor (AVX-512); elsewhere torch's are faster."""
+    """Whether these kernels are made for this processor (AVX-512); elsewhere torch's are faster."""
     return bool(ops._function("has_lanes")())
 
 

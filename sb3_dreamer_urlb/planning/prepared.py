@@ -32,7 +32,7 @@ class PreparedAgent(PlannedAgent):
         model = agent.world_model
         variables, classes = model.rssm.logits_shape
 
-        its_head, its_dynamics = (NativeHead, NativeDynamics) if native.plans() else (Head, Dynamics)
+        its_head, its_dynamics = (NativeHead, NativeDynamics) if native.on_lanes() else (Head, Dynamics)
 
         def head(mlp: MLP) -> Head | NativeHead:
             return its_head(mlp, variables, classes, dtype)

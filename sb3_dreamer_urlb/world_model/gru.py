@@ -23,7 +23,7 @@ def recur(parts: th.Tensor, norm: nn.LayerNorm, deter: th.Tensor) -> th.Tensor:
     :param deter: the state before, float (n, D)
     """
     learns = th.is_grad_enabled() and norm.weight.requires_grad
-    if native.plans() and parts.device.type == "cpu" and len(parts) >= NATIVE_ROWS and not learns:
+    if native.on_lanes() and parts.device.type == "cpu" and len(parts) >= NATIVE_ROWS and not learns:
         new: th.Tensor = _Gates.apply(parts, norm.weight, norm.bias, norm.eps, deter)  # type: ignore[no-untyped-call]
         return new
     reset, candidate, update = norm(full(parts)).chunk(3, -1)
