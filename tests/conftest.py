@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -110,14 +111,19 @@ def batch(seeded: None) -> SequenceBatch:
     return SequenceBatch(observation, th.rand(*lead, ACTIONS) * 2 - 1, th.rand(lead), is_first, is_terminal)
 
 
-@pytest.fixture
-def kernels_of_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inside ``native.using()``, kernels of our own for tiny tensors, too, and on processors where torch's are faster."""
+@pytest.fixture(scope="module")
+def kernels() -> None:
+    """Where there is no compiler, there is nothing to test; where there is one, it must build them."""
     try:
         build.find_compiler()
     except build.NativeUnavailable as error:
         pytest.skip(str(error))
     assert native.why_not() is None
+
+
+@pytest.fixture
+def kernels_of_every_size(kernels: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inside ``native.using()``, kernels of our own for tiny tensors, too, and on processors where torch's are faster."""
     monkeypatch.setattr(activation, "SMALLEST_NATIVE", 0)
     monkeypatch.setattr(activation, "SMALLEST_NATIVE_LEARNING", 0)
     monkeypatch.setattr(activation, "SMALLEST_NATIVE_GRADIENT", {th.float32: 0, th.bfloat16: 0})
@@ -127,6 +133,24 @@ def kernels_of_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(convolution, "CHANNELS", 1)
     monkeypatch.setattr(gru, "NATIVE_ROWS", 1)
     monkeypatch.setattr(planner_ops, "fast", lambda: True)
+
+
+@contextmanager
+def threads_of(count: int) -> Iterator[None]:
+    """Inside, torch and kernels of our own use so many threads."""
+    before = th.get_num_threads()
+    th.set_num_threads(count)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test for each number of threads."""
+    with threads_of(request.param):
+        yield
 
 
 def infer(model: WorldModel, batch: SequenceBatch) -> Posterior:

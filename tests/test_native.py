@@ -26,24 +26,6 @@ SHAPES = [(7,), (1, 1), (7, 3), (5, 6), (40, 48), (0, 5), (3, 4, 200), (33, 1030
 IMAGES = [(5, 6, 7, 3), (2, 48, 9, 9), (3, 16, 1, 1), (2, 1, 5, 5)]
 
 
-@pytest.fixture(scope="module")
-def kernels():
-    """Where there is no compiler, there is nothing to test; where there is one, it must build them."""
-    try:
-        build.find_compiler()
-    except build.NativeUnavailable as error:
-        pytest.skip(str(error))
-    assert native.why_not() is None
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request):
-    before = th.get_num_threads()
-    th.set_num_threads(request.param)
-    yield
-    th.set_num_threads(before)
-
-
 @pytest.fixture
 def always(monkeypatch):
     """Use kernels for tiny tensors, too."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch as th
+from conftest import threads_of
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.world_model import gru
-
-pytestmark = pytest.mark.skipif(native.why_not() is not None, reason=str(native.why_not()))
 
 #: roundings of what is computed in float32; parts' gradients are rounded to their format
 ERROR = {th.float32: 5e-6, th.bfloat16: 2**-8}
@@ -30,7 +29,7 @@ def _inputs(rows: int, size: int, dtype: th.dtype) -> tuple[th.Tensor, th.Tensor
 
 
 @pytest.fixture(autouse=True)
-def lanes(monkeypatch):
+def lanes(kernels, monkeypatch):
     monkeypatch.setattr(native, "on_lanes", native.active)
     monkeypatch.setattr(gru, "NATIVE_ROWS", 1)
 
@@ -40,14 +39,9 @@ def lanes(monkeypatch):
 def test_it_is_torchs(dtype, rows, size, threads):
     th.manual_seed(rows * 71 + size)
     norm, (parts, old, slope) = _norm(size), _inputs(rows, size, dtype)
-    before = th.get_num_threads()
-    th.set_num_threads(threads)
-    try:
-        with native.using("native", "cpu"):
-            ours = gru.recur(parts, norm, old)
-            gradients = th.autograd.grad(ours, [parts, old], slope)
-    finally:
-        th.set_num_threads(before)
+    with threads_of(threads), native.using("native", "cpu"):
+        ours = gru.recur(parts, norm, old)
+        gradients = th.autograd.grad(ours, [parts, old], slope)
     theirs = gru.recur(parts, norm, old)
     expected = th.autograd.grad(theirs, [parts, old], slope)
     assert ours.grad_fn.name() == "_GatesBackward" != theirs.grad_fn.name()

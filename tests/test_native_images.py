@@ -9,7 +9,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
-from test_native import ROUNDING, kernels, threads  # noqa: F401 (fixtures)
+from test_native import ROUNDING
 from test_speed import Calls
 from torch import nn
 
@@ -40,7 +40,7 @@ SHAPES = [
 
 
 @pytest.fixture
-def tiles(kernels):  # noqa: F811
+def tiles(kernels):
     with native.using("native", "cpu"):
         if not product_ops.worthwhile(10**6, 32, 32):
             pytest.skip("this processor has no tiles")
@@ -58,7 +58,7 @@ def _image(*shape, dtype, seed=0):
 
 @pytest.mark.parametrize("dtype", ROUNDING)
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_passes_of_a_convolution(tiles, threads, shape, dtype):  # noqa: F811
+def test_passes_of_a_convolution(tiles, threads, shape, dtype):
     channels, size, n, kernel, stride, images = shape
     wide, bias = _image(images, channels, *size, dtype=dtype), th.randn(n)
     weight = _image(n, channels, *kernel, dtype=dtype, seed=1).contiguous()
@@ -159,7 +159,7 @@ def test_no_images(tiles):
 
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("shape", [(2, 5, 3, 16, 17), (1, 1, 3, 64, 64), (7, 1, 20, 16), (4, 3, 3, 5), (0, 3, 8, 8)], ids=str)
-def test_bytes_become_numbers(kernels, threads, shape, last):  # noqa: F811
+def test_bytes_become_numbers(kernels, threads, shape, last):
     """To the last bit, and laid out in the same way."""
     kind = Images(spaces.Box(0, 255, (3, 64, 64), np.uint8))
     raw = th.randint(0, 256, shape, dtype=th.uint8, generator=th.Generator().manual_seed(0))
@@ -177,7 +177,7 @@ def test_bytes_become_numbers(kernels, threads, shape, last):  # noqa: F811
 @pytest.mark.parametrize("dtype", ROUNDING)
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("shape", [(2, 5, 3, 16, 17), (3, 3, 64, 64), (1, 1, 3, 5)], ids=str)
-def test_loss_of_images(kernels, threads, shape, last, dtype):  # noqa: F811
+def test_loss_of_images(kernels, threads, shape, last, dtype):
     format = th.channels_last if last else th.contiguous_format
     x, target = (_image(*shape[-4:], dtype=th.float32, seed=i).expand(shape).flatten(0, -4) for i in (3, 4))
     x, target = x.to(dtype).contiguous(memory_format=format), target.contiguous(memory_format=format)
@@ -193,7 +193,7 @@ def test_loss_of_images(kernels, threads, shape, last, dtype):  # noqa: F811
     assert leaf.grad.stride() == x.stride() and (leaf.grad - slope).abs().max() <= 2 * ROUNDING[dtype] * slope.abs().max()
 
 
-def test_a_loss_that_lies_otherwise_in_memory(kernels):  # noqa: F811
+def test_a_loss_that_lies_otherwise_in_memory(kernels):
     mean, target = th.randn(4, 3, 5, 5), _image(4, 3, 5, 5, dtype=th.float32)
     with native.using("native", "cpu"):
         assert th.allclose(distributions.image_nll(mean, target), distributions.image_nll(mean, target.contiguous()))
@@ -207,7 +207,7 @@ def test_a_loss_that_lies_otherwise_in_memory(kernels):  # noqa: F811
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_world_models_learn_the_same(kernels, learner, batch, precision):  # noqa: F811
+def test_world_models_learn_the_same(kernels, learner, batch, precision):
     found = []
     for compile in ("eager", "native"):
         th.manual_seed(0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch as th
 import torch.nn.functional as F
-from test_native import ROUNDING, always, kernels  # noqa: F401 (fixtures)
+from test_native import ROUNDING
 from test_speed import Calls
 
 from sb3_dreamer_urlb import dense, distributions, native
@@ -17,7 +17,7 @@ PRODUCTS = ("rows_by_weights", "transposed_product", "lay_out_weights")
 
 
 @pytest.fixture
-def tiles(kernels):  # noqa: F811
+def tiles(kernels):
     with native.using("native", "cpu"):
         if not product_ops.available():
             pytest.skip("this processor has no tiles (AMX)")
@@ -25,7 +25,7 @@ def tiles(kernels):  # noqa: F811
 
 
 @pytest.fixture
-def lanes(kernels, monkeypatch):  # noqa: F811
+def lanes(kernels, monkeypatch):
     """Kernels for samples, which are right on processors where torch's are faster, too."""
     monkeypatch.setattr(planner_ops, "fast", lambda: True)
     with native.using("native", "cpu"):

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch as th
 import torch.nn.functional as F
+from conftest import threads_of
 from golden import deterministic_draws
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from sb3_dreamer_urlb import distributions, native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.native import build, planner_ops
+from sb3_dreamer_urlb.native import planner_ops
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 from sb3_dreamer_urlb.planning.native_parts import NativeDynamics, NativeHead
 from sb3_dreamer_urlb.planning.prepared import PreparedAgent
@@ -28,25 +29,11 @@ ROUNDING = {th.float32: 1e-6, th.bfloat16: 2**-8}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def kernels():
-    """Where there is no compiler, there is nothing to test; where there is one, it must build them."""
-    try:
-        build.find_compiler()
-    except build.NativeUnavailable as error:
-        pytest.skip(str(error))
-    assert native.why_not() is None
-    # On processors where torch's are faster they must be right all the same.
+def lanes(kernels):
+    """On processors where torch's are faster these must be right all the same."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(planner_ops, "fast", lambda: True)
         yield
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request):
-    before = th.get_num_threads()
-    th.set_num_threads(request.param)
-    yield
-    th.set_num_threads(before)
 
 
 def _generator(seed: int = 0) -> th.Generator:
@@ -91,11 +78,10 @@ def test_draws_invert_the_distribution(n, variables, size, dtype, with_bias, cou
 
 def test_draws_do_not_depend_on_threads():
     logits, uniform = _numbers(600, 4, 32), th.rand(600, 4)
-    before, drawn = th.get_num_threads(), []
+    drawn = []
     for count in (1, 2):
-        th.set_num_threads(count)
-        drawn.append(planner_ops.draws(logits, None, uniform, True, True))
-    th.set_num_threads(before)
+        with threads_of(count):
+            drawn.append(planner_ops.draws(logits, None, uniform, True, True))
     assert all(th.equal(*pair) for pair in zip(*drawn, strict=True))
 
 
@@ -360,11 +346,8 @@ def test_who_plans_with_them(agent, monkeypatch):
 def test_plans_do_not_depend_on_threads(agent):
     planner = DynaMPC(PlannerConfig(horizon=2, n_samples=600, iterations=2, top_k=5), 0.95)
     state, plans = _start(agent[0].world_model.rssm, 0, N), []
-    before = th.get_num_threads()
     for count in (1, 2):
-        th.set_num_threads(count)
-        with th.no_grad():
+        with th.no_grad(), threads_of(count):
             ready = _prepared(*agent, th.float32)
             plans.append(planner.plan(ready, state, th.zeros(N, 2, 2), _generator(1), explore=True)[1])
-    th.set_num_threads(before)
     assert th.allclose(*plans, atol=1e-4)

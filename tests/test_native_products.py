@@ -6,14 +6,13 @@ import ctypes
 import itertools
 import math
 import subprocess
-from contextlib import contextmanager
 
 import pytest
 import torch as th
 import torch.nn.functional as F
+from conftest import threads_of
 from hypothesis import example, given
 from hypothesis import strategies as st
-from test_native import kernels  # noqa: F401 (fixture)
 
 from sb3_dreamer_urlb.native import build, product_ops
 
@@ -25,20 +24,10 @@ ROUNDING = {th.float32: 2.0**-23, th.bfloat16: 2.0**-8}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def tiles(kernels):  # noqa: F811
+def tiles(kernels):
     """One reason for all."""
     if not product_ops.available():
         pytest.skip("this processor has no tiles (AMX)")
-
-
-@contextmanager
-def _threads(count):
-    before = th.get_num_threads()
-    th.set_num_threads(count)
-    try:
-        yield
-    finally:
-        th.set_num_threads(before)
 
 
 def _numbers(*shape, dtype=th.float32, seed=0):
@@ -95,7 +84,7 @@ def test_rows_by_weights(rows, inputs, outputs, dtype, layout, transposed, with_
     weight = _view(outputs, inputs, dtype, 2, inputs + 5, 2)
     given_weight = _view(inputs, outputs, dtype, 0, outputs + 5, 2).copy_(weight.T) if transposed else weight
     bias = _numbers(outputs, seed=3) if with_bias else None
-    with _threads(threads):
+    with threads_of(threads):
         laid = product_ops.lay_out_weights(given_weight, transposed)
         found = product_ops.rows_by_weights(x, laid, outputs, bias, elu)
     exact, magnitude = x.double() @ weight.double().T, x.double().abs() @ weight.double().abs().T
@@ -120,11 +109,11 @@ def test_three_parts_are_as_good_as_float32(depth):
     assert errors[1].max() < 2.0**-20
 
 
-def test_sums_do_not_depend_on_threads():
+def test_sums_do_not_depend_onthreads_of():
     x, weight = _numbers(400, 70), _numbers(50, 70, seed=1)
     found = []
     for count in (1, 2):
-        with _threads(count):
+        with threads_of(count):
             laid = product_ops.lay_out_weights(weight, False)
             found.append(product_ops.rows_by_weights(x, laid, 50, None, False))
     assert th.equal(*found)
@@ -140,7 +129,7 @@ def test_sums_do_not_depend_on_threads():
 def test_transposed_product(rows, m, n, dtype, layout, threads):
     left = _view(rows, m, dtype, 1, *STRIDES[layout](m))
     right = _view(rows, n, dtype, 2, *STRIDES[layout](n))
-    with _threads(threads):
+    with threads_of(threads):
         found = product_ops.transposed_product(left, right)
     assert found.dtype == th.float32
     _near(found, left.double().T @ right.double(), left.double().abs().T @ right.double().abs())
@@ -165,7 +154,7 @@ def test_chain(rows, widths, dtype, layout, with_plus, short, threads):
     weights = [(_numbers(n, m, seed=i) / m**0.5).to(dtype) for i, (m, n) in enumerate(itertools.pairwise(widths))]
     biases = [_numbers(n, seed=9 + i) for i, n in enumerate(widths[1:])]
     plus = _view(rows, widths[1], dtype, 4, *STRIDES[layout](widths[1])) if with_plus else None
-    with _threads(threads):
+    with threads_of(threads):
         laid = [product_ops.lay_out_weights(weight, False) for weight in weights]
         found = product_ops.chain(x, plus, laid, biases, short)
     exact = x.double()
@@ -355,7 +344,7 @@ def test_others_find_their_tiles_as_they_left_them(tmp_path):
     its = ctypes.CDLL(str(tmp_path / "shapes.so"))
     x, weight = _numbers(64, 40), _numbers(50, 40)
     laid = product_ops.lay_out_weights(weight, False)
-    with _threads(1):
+    with threads_of(1):
         for call in (
             lambda: product_ops.rows_by_weights(x, laid, 50, None, False),
             lambda: product_ops.chain(x, None, [laid], [th.zeros(50)], False),
@@ -373,7 +362,7 @@ def test_products_of_others_in_between():
     exact, other = x.double() @ weight.double().T, odd.double() @ narrow.double().T
     laid = product_ops.lay_out_weights(weight, False)
     for count in (1, 2):
-        with _threads(count):
+        with threads_of(count):
             for _ in range(5):
                 theirs, small = F.linear(x, weight), F.linear(odd, narrow)
                 ours = product_ops.rows_by_weights(x, laid, 70, None, False)
