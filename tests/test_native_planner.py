@@ -11,10 +11,10 @@ from conftest import threads_of
 from golden import deterministic_draws
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planning_forms import METHODS, M, N, agent_and_skill, check_short_products, check_states_and_scores
 
 from sb3_dreamer_urlb import distributions, native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
-from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.native import planner_ops
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 from sb3_dreamer_urlb.planning.native_parts import NativeDynamics, NativeHead
@@ -254,18 +254,11 @@ def test_what_kernels_do_not_take():
 
 # -- the whole -------------------------------------------------------------------------------------------------------------
 
-N, M = 2, 6
 
-
-@pytest.fixture(params=[(None, False), (None, True), ("diayn", False), ("aps", False)], ids=str)
+@pytest.fixture(params=METHODS, ids=str)
 def agent(request, world_model):
     """With N environments' skills, and with layers that matter, unlike fresh ones."""
-    method, discount_head = request.param
-    its = Agent(world_model(discount_head=discount_head), [8, 8], make_intrinsic_reward(method, {}))
-    with th.no_grad():
-        for parameter in its.parameters():
-            parameter.copy_(0.5 * th.randn_like(parameter))
-    return its, th.zeros(N, 0) if its.skills is None else its.skills.draw(N)
+    return agent_and_skill(world_model, *request.param)
 
 
 def _prepared(agent, skill, dtype, compile="native") -> PreparedAgent:
@@ -280,21 +273,7 @@ def _start(rssm: RSSM, seed: int, n: int = N * M) -> LatentState:
 def test_same_states_and_scores(agent, threads):
     plain, ready = PlannedAgent(*agent), _prepared(*agent, th.float32)
     assert isinstance(ready._dynamics, NativeDynamics) and isinstance(ready._value, NativeHead)
-    rssm = plain.agent.world_model.rssm
-    with th.no_grad(), deterministic_draws():
-        starts = [_start(rssm, seed) for seed in (0, 1)]
-        for start in (starts[0], *starts):  # the second time, the start is known
-            states = {plain: [start], ready: [start]}
-            for _ in range(3):
-                action = th.rand(N * M, 2) * 2 - 1
-                for its, visited in states.items():
-                    visited.append(its.step(visited[-1], action, None))
-            for a, b in zip(*states.values(), strict=True):
-                assert th.allclose(a.feature, b.feature, atol=1e-5)
-            features = {its: its.features(visited[1:]) for its, visited in states.items()}
-            for ask in ("rewards", "values", "discounts"):
-                a, b = (getattr(its, ask)(feature[1:]) for its, feature in features.items())
-                assert a.shape == (2, N * M) and th.allclose(a, b, atol=1e-4), ask
+    check_states_and_scores(plain, ready, [_start(plain.agent.world_model.rssm, seed) for seed in (0, 1)], tolerance=1e-4)
 
 
 def test_heads_without_hidden_layers(world_model):
@@ -325,15 +304,7 @@ def test_same_plan_of_the_same_random_numbers(agent):
 
 def test_short_products_stay_close(world_model):
     its = Agent(world_model(), [8, 8], None)
-    state, action = _start(its.world_model.rssm, 0), th.rand(N * M, 2)
-    scores = []
-    for dtype in FORMATS:
-        ready = _prepared(its, th.zeros(1, 0), dtype)
-        with th.no_grad(), deterministic_draws():
-            first = ready.step(state, action, None)
-            scores.append(ready.values(ready.features([ready.step(first, action, None)])))
-        assert scores[-1].dtype == first.deter.dtype == th.float32 and first.short.dtype == dtype
-    assert not th.equal(*scores) and th.allclose(*scores, atol=0.05)
+    check_short_products(lambda dtype: _prepared(its, th.zeros(1, 0), dtype), _start(its.world_model.rssm, 0))
 
 
 def test_who_plans_with_them(agent, monkeypatch):

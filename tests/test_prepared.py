@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import pytest
 import torch as th
-from golden import deterministic_draws
+from planning_forms import METHODS, M, N, agent_and_skill, check_short_products, check_states_and_scores
 
 from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
-from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.planning import prepacked, prepared, prepared_parts
 from sb3_dreamer_urlb.planning.prepared import PreparedAgent, planned
 from sb3_dreamer_urlb.types import LatentState
 
-N, M = 2, 6
 
-
-@pytest.fixture(params=[(None, False), (None, True), ("diayn", False), ("aps", False)], ids=str)
+@pytest.fixture(params=METHODS, ids=str)
 def agents(request, world_model, monkeypatch):
     """The plain and the prepared form of one agent with N environments; several blocks of everything."""
     monkeypatch.setattr(prepared_parts, "BLOCK", 2)
     monkeypatch.setattr(prepared, "ROWS", 5)
-    method, discount_head = request.param
-    agent = Agent(world_model(discount_head=discount_head), [8, 8], make_intrinsic_reward(method, {}))
-    # Fresh layers hardly differ from none: biases, norms and logits that matter.
-    with th.no_grad():
-        for parameter in agent.parameters():
-            parameter.copy_(0.5 * th.randn_like(parameter))
-    skill = th.zeros(N, 0) if agent.skills is None else agent.skills.draw(N)
+    agent, skill = agent_and_skill(world_model, *request.param)
     return PlannedAgent(agent, skill), PreparedAgent(agent, skill, th.float32)
 
 
@@ -35,35 +26,12 @@ def test_same_states_and_scores(agents):
     plain, ready = agents
     rssm = plain.agent.world_model.rssm
     starts = [LatentState(th.randn(N * M, rssm.stoch_size), th.randn(N * M, rssm.deter_size)) for _ in range(2)]
-    with th.no_grad(), deterministic_draws():
-        for start in (starts[0], *starts):  # the second time, the start is known
-            states = {plain: [start], ready: [start]}
-            for _ in range(3):
-                action = th.rand(N * M, 2) * 2 - 1
-                for its, visited in states.items():
-                    visited.append(its.step(visited[-1], action, None))
-            features = {its: its.features(visited[1:]) for its, visited in states.items()}
-            for a, b in zip(*states.values(), strict=True):
-                assert th.allclose(a.feature, b.feature, atol=1e-5)
-            for ask in (PlannedAgent.rewards, PlannedAgent.values, PlannedAgent.discounts):
-                a, b = (getattr(its, ask.__name__)(feature[1:]) for its, feature in features.items())
-                assert a.shape == (2, N * M) and th.allclose(a, b, atol=1e-5), ask.__name__
-            a, b = (its.act(visited[-1].feature, None) for its, visited in states.items())
-            assert th.allclose(a, b, atol=1e-5)
+    check_states_and_scores(plain, ready, starts)
 
 
 def test_short_products_stay_close(world_model):
     agent = Agent(world_model(), [8, 8], None)
-    state, action = agent.world_model.rssm.initial(M), th.rand(M, 2)
-    scores = []
-    for dtype in (th.float32, th.bfloat16):
-        ready = PreparedAgent(agent, th.zeros(1, 0), dtype)
-        with th.no_grad(), deterministic_draws():
-            first = ready.step(state, action, None)
-            features = ready.features([ready.step(first, action, None)])
-            scores.append(ready.values(features))
-        assert scores[-1].dtype == first.deter.dtype == th.float32 and first.short.dtype == dtype
-    assert not th.equal(*scores) and th.allclose(*scores, atol=0.05)
+    check_short_products(lambda dtype: PreparedAgent(agent, th.zeros(1, 0), dtype), agent.world_model.rssm.initial(M))
 
 
 def test_extreme_logits_are_drawn(world_model):
