@@ -301,6 +301,7 @@ def test_what_the_others_do_not_take():
         "a bias for 50 outputs cannot be torch.float64": lambda: product_ops.chain(
             x, None, [laid], [th.zeros(50).double()], False
         ),
+        r"a bias for 50 outputs cannot be .* \(50, 1\)": lambda: product_ops.chain(x, None, [laid], [th.zeros(50, 1)], False),
         "rows must be contiguous": lambda: product_ops.lay_out_weights(weight.T, True),
         r"transpose of .* \(70, 40\) .* with .* \(60, 40\)": lambda: product_ops.transposed_product(x, x[:60]),
         "with torch.bfloat16": lambda: product_ops.transposed_product(x, x.bfloat16()),
