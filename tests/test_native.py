@@ -60,6 +60,17 @@ def _close(ours, exact, dtype, scale=1.0):
 # -- kernels ---------------------------------------------------------------------------------------------------------------
 
 
+def test_elu_of_every_bfloat16_number(kernels):
+    """Relative to the result down to 1e-4."""
+    x = th.arange(2**16, dtype=th.int32).to(th.int16).view(th.bfloat16)
+    exact = F.elu(x.double())
+    ours = x.clone()
+    ops.bias_elu_(ours, None)
+    finite = exact.isfinite()
+    assert ((ours.double() - exact).abs() <= (2.0**-8 + 5e-4) * exact.abs() + 2e-7)[finite].all()
+    assert th.equal(ours[x.isnan()].isnan(), x[x.isnan()].isnan()) and th.equal(ours[x.isinf()].double(), exact[x.isinf()])
+
+
 @pytest.mark.parametrize("with_bias", [False, True])
 @pytest.mark.parametrize("dtype", ROUNDING)
 @pytest.mark.parametrize("shape", SHAPES + IMAGES, ids=str)

@@ -38,7 +38,7 @@ struct Behind {
                 Two p = load_two<some>(its_plus + i * plus_stride, mask);
                 y = {y.low + p.low, y.high + p.high};
             }
-            if (its_elu) y = {::elu(y.low), ::elu(y.high)};
+            if (its_elu) y = {elu_in<Out>(y.low), elu_in<Out>(y.high)};
             store_two<some>(its_out, y, mask);
         }
     }
@@ -53,9 +53,10 @@ static inline void block_by_weights(const Left& left, const uint16_t* weights, I
     for (Index p = 0; p < panels; p++) {
         const float* before = sums[(p + 1) % 2];
         zero_sums();
-        add_steps<PARTS<T>>(left, weights + p * steps * 2 * PARTS<T> * NUMBERS, steps, p % 2, [&](Index i) {
-            if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
-        });
+        add_steps<PARTS<T>>(height > TILE, outputs - p * PANEL > TILE, left, weights + p * steps * 2 * PARTS<T> * NUMBERS, steps,
+                            p % 2, [&](Index i) {
+                                if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
+                            });
         store_sums(sums[p % 2]);
     }
     behind(sums[(panels - 1) % 2], r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);

@@ -15,11 +15,11 @@ static void bias_elu(T* x, const T* bias, Index rows, Index columns, int threads
         Index i = 0;
         for (; i + LANES <= size; i += LANES) {
             Floats y = load(row + i);
-            store(row + i, elu(bias ? y + load(bias + i) : y));
+            store(row + i, elu_in<T>(bias ? y + load(bias + i) : y));
         }
         if (i < size) {
             Floats y = load(row + i, size - i);
-            store(row + i, elu(bias ? y + load(bias + i, size - i) : y), size - i);
+            store(row + i, elu_in<T>(bias ? y + load(bias + i, size - i) : y), size - i);
         }
     }
 }

@@ -1,62 +1,17 @@
-// What the GRU does behind its product: a layer norm over all three parts, two gates, a candidate, the new state; and its gradient.
+// What the GRU does behind its product (gates.h), for all rows; and its gradient.
 
-#include "lanes.h"
+#include "gates.h"
 
 #include <vector>
 
-// The sum of some function of numbers; four sums at a time, because each addition waits for the one before.
-template <class T, class F>
-static inline float sum_of(const T* x, Index size, F of) {
-    Floats sums[4] = {};
-    Index i = 0;
-    for (; i + 4 * LANES <= size; i += 4 * LANES) {
-        for (Index j = 0; j < 4; j++) sums[j] += of(load(x + i + j * LANES));
-    }
-    for (; i < size; i += LANES) sums[0] += first_lanes(of(load_up_to(x + i, size - i)), size - i);
-    return total((sums[0] + sums[1]) + (sums[2] + sums[3]));
-}
-
-// Mean and 1 / standard deviation of a row.
-struct Norm {
-    float mean, scale;
-};
-template <class T>
-static inline Norm norm_of(const T* row, Index size, float epsilon) {
-    const float mean = sum_of(row, size, [](Floats x) { return x; }) / size;
-    const float variance = sum_of(row, size, [mean](Floats x) { return (x - mean) * (x - mean); }) / size;
-    return {mean, 1.0f / __builtin_sqrtf(variance + epsilon)};
-}
-
-// What sixteen numbers of the three parts give.
-struct Gates {
-    Floats reset, input, candidate, update;
-
-    template <class T>
-    static Gates of(const T* row, const float* weight, const float* bias, Norm norm, Index i, Index size) {
-        auto normed = [&](Index at) {
-            return (load_up_to(row + at, size - i) - norm.mean) * norm.scale * load_up_to(weight + at, size - i) +
-                   load_up_to(bias + at, size - i);
-        };
-        const Floats reset = sigmoid(normed(i)), input = normed(size + i);
-        return {reset, input, tanh(reset * input), sigmoid(normed(2 * size + i) - 1.0f)};
-    }
-};
-
-// parts (rows, 3 · size): reset, candidate, update, before their norm with weight and bias (3 · size); old (rows, size) → deter (rows,
-// size), and the same in T, its rows short_stride apart; null for none. A bias of -1 makes a fresh GRU forget slowly.
+// parts (rows, 3 · size), old (rows, size) → deter (rows, size), and the same in T, its rows short_stride apart; null for none.
 template <class T>
 static void gates(const T* parts, const float* weight, const float* bias, float epsilon, const float* old, float* deter, T* shorter,
                   Index short_stride, Index rows, Index size, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(static) if (rows * size > WORTH_A_THREAD / 4)
     for (Index r = 0; r < rows; r++) {
-        const T* row = parts + r * 3 * size;
-        const Norm norm = norm_of(row, 3 * size, epsilon);
-        for (Index i = 0; i < size; i += LANES) {
-            const Gates its = Gates::of(row, weight, bias, norm, i, size);
-            const Floats before = load_up_to(old + r * size + i, size - i), now = before + its.update * (its.candidate - before);
-            store_up_to(deter + r * size + i, now, size - i);
-            if (shorter) store_up_to(shorter + r * short_stride + i, now, size - i);
-        }
+        gates_of_row(parts + r * 3 * size, weight, bias, epsilon, old + r * size, deter + r * size,
+                     shorter ? shorter + r * short_stride : nullptr, size);
     }
 }
 

@@ -285,7 +285,8 @@ static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
     for (int left = 0; left < parts; left++) {
         _tile_loadd(4, a.upper + at + 2 * left * NUMBERS, a.row_bytes);
         if (tall == 2) _tile_loadd(5, a.lower + at + 2 * left * NUMBERS, a.row_bytes);
-        for (int right = 0; right < parts - left; right++) {
+        for (int i = 0; i < parts - left; i++) {
+            const int right = left == 0 ? (parts - i) % parts : parts - left - 1 - i;  // the order of whole steps
             _tile_loadd(6, b + 2 * right * NUMBERS, 64);
             if (wide == 2) _tile_loadd(7, b + (2 * right + 1) * NUMBERS, 64);
             _tile_dpbf16ps(0, 4, 6);
