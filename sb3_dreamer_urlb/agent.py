@@ -90,6 +90,14 @@ class PlannedAgent:
         """Sample the next state from the prior."""
         return self.agent.world_model.rssm.planning_step(state, action, self._stoch_rows, generator)
 
+    def imagine(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """What the heads read of states 1 … H, sampled from the prior with the actions (n·M, H, A): (H, n·M, F)."""
+        states = []
+        for its in action.unbind(1):
+            state = self.step(state, its, generator)
+            states.append(state)
+        return self.features(states)
+
     def features(self, states: Sequence[LatentState]) -> th.Tensor:
         """What the heads read of T successive states, (T, n·M, F)."""
         return th.stack([state.feature for state in states])

@@ -26,7 +26,7 @@ from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.learner import Learner, LearnerConfig
-from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
+from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig, native_parts
 from sb3_dreamer_urlb.planning.prepared import planned
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
 from sb3_dreamer_urlb.world_model.observations import Images
@@ -237,8 +237,10 @@ def _most_probable_and_probs(logits: th.Tensor, generator: th.Generator | None =
 
 @contextmanager
 def deterministic_draws() -> Iterator[None]:
-    """A categorical draw is its most probable class, an actor's draw its mean."""
+    """A categorical draw is its most probable class, an actor's draw its mean; trajectories are imagined step by step, because
+    the pass that does many steps has its draws inside (tests/test_native_rollout.py: it does what steps do)."""
     with (
+        mock.patch.object(native_parts.NativeDynamics, "imagine", lambda *_: None),
         mock.patch.object(distributions, "draw_classes", lambda probs, generator=None: probs.argmax(-1)),
         mock.patch.object(distributions, "draw_classes_of_logits", _most_probable),
         mock.patch.object(distributions, "draw_classes_and_probs", _most_probable_and_probs),

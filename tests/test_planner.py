@@ -31,8 +31,12 @@ class Toy:
         self.actions.append(action)
         return LatentState(state.stoch, action)
 
-    def features(self, states):
-        return th.stack([state.feature for state in states])
+    def imagine(self, state, action, generator):
+        features = []
+        for its in action.unbind(1):
+            state = self.step(state, its, generator)
+            features.append(state.feature)
+        return th.stack(features)
 
     def rewards(self, feature):
         return -(feature[..., A:] - feature[..., :A]).square().sum(-1)

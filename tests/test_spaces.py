@@ -237,8 +237,12 @@ class _Guess:
         t = state.deter[:, :1].long()
         return LatentState(reward.gather(1, t.clamp(max=2)), state.deter + 1)
 
-    def features(self, states):
-        return th.stack([state.feature for state in states])
+    def imagine(self, state, action, generator):
+        features = []
+        for its in action.unbind(1):
+            state = self.step(state, its, generator)
+            features.append(state.feature)
+        return th.stack(features)
 
     def rewards(self, feature):
         return feature[..., 0]

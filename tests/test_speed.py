@@ -30,8 +30,8 @@ BOUNDS = {
     # Kernels of our own wherever there is one, as at full size; one lays weights out for each product.
     ("update", "lbs", "float32", "native"): 1770,
     ("update", "lbs", "bfloat16", "native"): 2040,
-    ("plan", None, "float32", "native"): 450,
-    ("plan", None, "bfloat16", "native"): 475,
+    ("plan", None, "float32", "native"): 355,
+    ("plan", None, "bfloat16", "native"): 380,
 }
 PLANNER = PlannerConfig(horizon=3, n_samples=8, iterations=2, top_k=4, mixture=0.25)
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import torch as th
 
-from sb3_dreamer_urlb.native import image_ops, ops, pixel_ops, planner_ops, product_ops
+from sb3_dreamer_urlb.native import image_ops, ops, pixel_ops, planner_ops, product_ops, rollout_ops
 from sb3_dreamer_urlb.native.build import NativeUnavailable, load
 
 #: values of ``compile`` that use them

@@ -8,7 +8,7 @@ template <class T, class Out>
 static void chain(const T* x, Index stride, Index rows, const T* plus, Index plus_stride, const ChainLayer* layers, Index count, Out* out,
                   int threads) {
     const Index widest = widest_of(layers, count), outputs = layers[count - 1].outputs;
-    by_blocks(rows, threads, [=] { return Between<T>(widest); }, [=](const Between<T>& between, Index r, Index height) {
+    by_blocks(rows, PANEL, threads, [=] { return Between<T>(widest); }, [=](const Between<T>& between, Index r, Index height) {
         between.chain(x + r * stride, stride, height, plus ? plus + r * plus_stride : nullptr, plus_stride, layers, count,
                       out + r * outputs, outputs);
     });

@@ -65,10 +65,10 @@ struct Between {
     }
 };
 
-// Calls work(first row, rows) with at most 32 rows at a time; threads share the rows as evenly as tiles allow. Each has `make`
+// Calls work(first row, rows) with at most `most` rows at a time; threads share the rows as evenly as tiles allow. Each has `make`
 // something of its own for work to use.
 template <class Make, class Work>
-static void by_blocks(Index rows, int threads, Make make, Work work) {
+static void by_blocks(Index rows, Index most, int threads, Make make, Work work) {
     const Index tiles = (rows + TILE - 1) / TILE;
 #pragma omp parallel num_threads(least(threads, (tiles + 1) / 2))
     {
@@ -76,7 +76,7 @@ static void by_blocks(Index rows, int threads, Make make, Work work) {
         Tiles shaped;
         const Index me = omp_get_thread_num(), all_of_us = omp_get_num_threads();
         const Index end = least(tiles * (me + 1) / all_of_us * TILE, rows);
-        for (Index r = tiles * me / all_of_us * TILE; r < end; r += PANEL) work(mine, r, least(end - r, PANEL));
+        for (Index r = tiles * me / all_of_us * TILE; r < end; r += most) work(mine, r, least(end - r, most));
     }
 }
 

@@ -25,7 +25,4 @@ FOR(BF16, BF16, bfloat16)
 #ifdef __AVX512FP16__
 FOR(Half, BF16, half)
 EXPORT int has_halves() { return 1; }
-#else
-EXPORT void gather_half() {}
-EXPORT int has_halves() { return 0; }
 #endif

@@ -24,16 +24,15 @@ GATHER = (
 ops.ARGUMENTS.update(
     {
         "has_lanes": (),
-        "has_halves": (),
         "draws_": (*[_POINTER] * 5, *[_INDEX] * 4, _INT),
         "gather_": GATHER,
-        "gather_half": GATHER,
         "gates_": (_POINTER, _POINTER, _POINTER, _FLOAT, *[_POINTER] * 3, *[_INDEX] * 3, _INT),
         "gates_backward_": (*[_POINTER] * 4, _FLOAT, *[_POINTER] * 3, _INDEX, _INDEX, _INT),
         "one_hot_": (_POINTER, _POINTER, _INDEX, _INDEX, _INT),
         "softmax_backward_": (_POINTER, _POINTER, _POINTER, _INDEX, _INDEX, _INT),
     }
 )
+ops.OPTIONAL["has_halves"] = {"gather_half": GATHER}
 
 
 def fast() -> bool:
@@ -80,7 +79,7 @@ def draws(
 def rows_format(dtype: th.dtype) -> th.dtype:
     """Of rows whose sums are asked for in ``dtype``: float16 in place of bfloat16 where the processor adds such numbers, twice
     as fast and more exactly, as long as weights stay below 16 000."""
-    return th.float16 if dtype == th.bfloat16 and ops._function("has_halves")() else dtype
+    return th.float16 if dtype == th.bfloat16 and "gather_half" in ops._functions else dtype
 
 
 @ops.operator("one_hot(Tensor classes, Tensor like) -> Tensor")

@@ -7,6 +7,7 @@ half the time that this processor's float32 arithmetic takes (docs/performance.m
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch as th
 
@@ -17,6 +18,13 @@ _POINTER, _INDEX, _INT = ops._POINTER, ops._INDEX, ops._INT
 PANEL = 32
 #: rows from which on a product is worth laying the weights out, and columns and depth that tiles are filled with
 ROWS, COLUMNS = 256, 32
+
+
+class ChainLayer(ctypes.Structure):
+    """As chain.h has it."""
+
+    _fields_ = (("weights", _POINTER), ("bias", _POINTER), ("depth", _INDEX), ("outputs", _INDEX))
+
 
 ops.OPTIONAL["has_tiles"] = {
     "lay_out_weights_": (_POINTER, _INDEX, _INDEX, _INDEX, _INT, _POINTER, _INT),
@@ -96,25 +104,39 @@ def chain(x: th.Tensor, plus: th.Tensor | None, laid: list[th.Tensor], biases: l
     _check_rows(x)
     _check_inputs(x)
     rows, depth = x.shape
-    numbers: list[int] = []
-    for weights, bias in zip(laid, biases, strict=True):
-        outputs = len(bias)
-        if weights.numel() != _laid_size(depth, outputs, x.dtype):
-            raise ValueError(f"these weights were not laid out for {depth} inputs and {outputs} outputs in {x.dtype}.")
-        _check_bias(bias, outputs)
-        numbers += [weights.data_ptr(), bias.data_ptr(), depth, outputs]
-        depth = outputs
+    layers = chain_layers(depth, laid, biases, x.dtype)
     plus_row = 0
     if plus is not None:
         if plus.dtype != x.dtype or plus.shape != (rows, len(biases[0])) or plus.stride(1) != 1:
             raise ValueError(f"to {rows} rows of {len(biases[0])} outputs one cannot add {ops._describe(plus)}.")
         plus_row = plus.stride(0)
-    y = x.new_empty(rows, depth, dtype=x.dtype if short else th.float32)
+    y = x.new_empty(rows, layers[-1].outputs, dtype=x.dtype if short else th.float32)
     if y.numel():
-        layers = (ctypes.c_int64 * len(numbers))(*numbers)
         place = None if plus is None else plus.data_ptr()
         function(x.data_ptr(), x.stride(0), rows, place, plus_row, layers, len(laid), y.data_ptr(), th.get_num_threads())
     return y
+
+
+def chain_layers(
+    depth: int, laid: Sequence[th.Tensor], biases: Sequence[th.Tensor], dtype: th.dtype
+) -> ctypes.Array[ChainLayer]:
+    """Layers one after the other, as the kernels read them. They hold no reference to the tensors.
+
+    :param depth: inputs of the first layer
+    :param laid: what :func:`lay_out_weights` gave for the weights of each layer
+    :param biases: float32 (outputs,) of each layer
+    :param dtype: of the weights
+    :raises ValueError: for weights and biases that do not fit
+    """
+    layers = (ChainLayer * len(laid))()
+    for layer, weights, bias in zip(layers, laid, biases, strict=True):
+        outputs = len(bias)
+        if weights.numel() != _laid_size(depth, outputs, dtype):
+            raise ValueError(f"these weights were not laid out for {depth} inputs and {outputs} outputs in {dtype}.")
+        _check_bias(bias, outputs)
+        layer.weights, layer.bias, layer.depth, layer.outputs = weights.data_ptr(), bias.data_ptr(), depth, outputs
+        depth = outputs
+    return layers
 
 
 @ops.operator("transposed_product(Tensor left, Tensor right) -> Tensor")

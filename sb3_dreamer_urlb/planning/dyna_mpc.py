@@ -5,7 +5,6 @@ Symbols: n environments, H horizon, N sampled and P actor trajectories, M = N + 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -25,8 +24,9 @@ class PlannableModel(Protocol):
     def step(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> LatentState:
         """Sample the next state from the prior."""
 
-    def features(self, states: Sequence[LatentState]) -> th.Tensor:
-        """What the three below read of T successive states, (T, …, F); or anything else that slices like it."""
+    def imagine(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """What the three below read of states 1 … H, sampled from the prior with the actions (n, H, A): (H, n, F), or anything
+        else that slices like it."""
 
     def rewards(self, feature: th.Tensor) -> th.Tensor:
         """Predicted reward of each state, (…, F) → (…)."""
@@ -146,14 +146,10 @@ class DynaMPC:
         self, model: PlannableModel, state: LatentState, actions: th.Tensor, generator: th.Generator | None
     ) -> th.Tensor:
         """The λ-return at state 1 of each trajectory (the reward of state 0 is the same for all), float (n, M)."""
-        states = []
-        for action in actions.flatten(0, 1).unbind(1):
-            state = model.step(state, action, generator)
-            states.append(state)
-        feature = model.features(states)  # states 1 … H
+        feature = model.imagine(state, actions.flatten(0, 1), generator)
         reward, discount = model.rewards(feature[:-1]), model.discounts(feature[:-1])
         # Index 0 of the values is never read by the return.
-        value = reward.new_zeros(len(states), *reward.shape[1:])
+        value = reward.new_zeros(actions.shape[2], *reward.shape[1:])
         if self.config.use_value:
             value[1:] = model.values(feature[1:])
         return lambda_return(reward, value, discount, self.gae_lambda)[0].view(actions.shape[:2])

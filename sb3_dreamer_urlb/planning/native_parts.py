@@ -8,11 +8,11 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.native import planner_ops
+from sb3_dreamer_urlb.native import planner_ops, rollout_ops
 from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
 from sb3_dreamer_urlb.nets import MLP
 from sb3_dreamer_urlb.planning.chain import Chain
-from sb3_dreamer_urlb.planning.prepared_parts import SampledState
+from sb3_dreamer_urlb.planning.prepared_parts import SampledState, Visited
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
@@ -76,6 +76,24 @@ class NativeDynamics:
         logits = self.logits(short, short=True).view(-1, *self.shape)
         classes = distributions.draw_classes_of_logits(logits, generator)
         return SampledState(classes, deter, short, self.stoch_size, next_inputs)
+
+    def imagine(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> Visited | None:
+        """The states of many steps, in one pass and from the same random numbers as steps would use; None where the processor
+        has no tiles.
+
+        :param state: n starts
+        :param action: float (n, H, A)
+        :param generator: source of randomness, the global one if None
+        """
+        if not self.gru.laid:
+            return None
+        addend, _ = self._start_part(state)
+        uniform = th.rand(action.shape[1], len(action), self.shape[0], generator=generator)
+        layers = [self.rows, self.action_rows, self.bias, *self.gru.laid, *self.gru.biases, *self.norm]
+        prior = [tensor for pair in zip(self.logits.laid, self.logits.biases, strict=True) for tensor in pair]
+        start = state.deter.contiguous()
+        classes, short = rollout_ops.rollout(start, addend, action.contiguous(), uniform, layers + prior, self.epsilon)
+        return Visited(classes, short)
 
     def _start_part(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
         """Computed once: each iteration of a plan begins with the same states."""

@@ -47,6 +47,16 @@ class PreparedAgent(PlannedAgent):
         with th.autocast("cpu", enabled=False):
             return self._dynamics.step(state, action, generator)
 
+    def imagine(  # type: ignore[override]
+        self, state: LatentState, action: th.Tensor, generator: th.Generator | None
+    ) -> Visited:
+        if isinstance(self._dynamics, NativeDynamics):
+            with th.autocast("cpu", enabled=False):
+                visited = self._dynamics.imagine(state, action, generator)
+            if visited is not None:
+                return visited
+        return super().imagine(state, action, generator)  # type: ignore[return-value]
+
     def features(self, states: Sequence[SampledState]) -> Visited:  # type: ignore[override]
         return Visited(th.stack([state.classes for state in states]), th.stack([state.short for state in states]))
 
