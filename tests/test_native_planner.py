@@ -26,6 +26,8 @@ from sb3_dreamer_urlb.world_model.rssm import RSSM
 FORMATS = [th.float32, th.bfloat16]
 #: relative errors of one number
 ROUNDING = {th.float32: 1e-6, th.bfloat16: 2**-8}
+#: what a GRU's new state may be off where it is asked for in a format
+GATES = {th.float32: 2e-5, th.bfloat16: 5e-4}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -214,7 +216,7 @@ def test_gates(n, size, dtype):
     new = planner_ops.gates(parts, weight, bias, 1e-5, old, room[:, 2:-1])
     reset, candidate, update = F.layer_norm(parts.double(), (3 * size,), weight.double(), bias.double()).chunk(3, -1)
     exact = th.lerp(old.double(), (reset.sigmoid() * candidate).tanh(), (update - 1).sigmoid())
-    assert new.dtype == th.float32 and th.allclose(new.double(), exact, atol=2e-5)
+    assert new.dtype == th.float32 and th.allclose(new.double(), exact, atol=GATES[dtype])
     assert th.equal(room[:, 2:-1], new.to(dtype)) and (room[:, :2] == 7).all() and (room[:, -1] == 7).all()
 
 

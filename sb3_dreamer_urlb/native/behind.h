@@ -16,7 +16,7 @@ struct Behind {
     Out* out;
     Index out_stride;
 
-    // sums: four tiles, of 32 rows and 32 columns of the result; the rows from begin to end and the first columns.
+    // sums: 32 rows and 32 columns of the result; the rows from begin to end and the first columns.
     void operator()(const float* sums, Index r, Index c, Index begin, Index end, Index columns) const {
         if (columns < PANEL)
             write<true>(sums, r, c, begin, end, columns);
@@ -32,8 +32,7 @@ struct Behind {
         const __mmask32 mask = first(columns);
         const Two b = !bias ? Two{} : load_two<some>(bias + c, mask);
         for (Index i = begin; i < end; i++, its_out += out_stride) {
-            const float* sum = sums + (i / TILE * 2 * TILE + i % TILE) * TILE;
-            Two y = {load(sum) + b.low, load(sum + TILE * TILE) + b.high};
+            Two y = {load(sums + i * PANEL) + b.low, load(sums + i * PANEL + TILE) + b.high};
             if (its_plus) {
                 Two p = load_two<some>(its_plus + i * plus_stride, mask);
                 y = {y.low + p.low, y.high + p.high};
@@ -48,18 +47,17 @@ struct Behind {
 template <class T, class Following>
 static inline void block_by_weights(const Left& left, const uint16_t* weights, Index steps, Index outputs, Index r, Index height,
                                     const Following& behind) {
-    alignas(64) float sums[2][4 * TILE * TILE];
-    const Index panels = (outputs + PANEL - 1) / PANEL, share = (height + steps - 1) / steps;
+    alignas(64) float sums[PANEL * PANEL];
+    const Index panels = (outputs + PANEL - 1) / PANEL, least_share = (height + steps - 1) / steps, share = least_share < 3 ? 3 : least_share;
     for (Index p = 0; p < panels; p++) {
-        const float* before = sums[(p + 1) % 2];
         zero_sums();
-        add_steps<PARTS<T>>(height > TILE, outputs - p * PANEL > TILE, left, weights + p * steps * 2 * PARTS<T> * NUMBERS, steps,
-                            p % 2, [&](Index i) {
-                                if (p > 0) behind(before, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
-                            });
-        store_sums(sums[p % 2]);
+        add_steps<PARTS<T>, LEFT_STAYS>(height > TILE, outputs - p * PANEL > TILE, left, weights + p * steps * 2 * PARTS<T> * NUMBERS,
+                                        steps, false, [&](Index i) {
+            if (p > 0 && i * share < height) behind(sums, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
+        });
+        store_sums(sums);
     }
-    behind(sums[(panels - 1) % 2], r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
+    behind(sums, r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
 }
 
 #endif

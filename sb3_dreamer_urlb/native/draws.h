@@ -55,21 +55,6 @@ template <class T>
 }
 
 #ifdef __AVX512DQ__
-// Thirty-two numbers, those at even places and those at odd ones.
-struct Pairs {
-    Floats even, odd;
-    static Pairs from(const BF16* p) {
-        const __m512i both = read<__m512i>(p);
-        return {(Floats)_mm512_slli_epi32(both, 16), (Floats)_mm512_and_si512(both, _mm512_set1_epi32(0xffff0000))};
-    }
-    static Pairs from(const float* p) {
-        const Ints places = {0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30};
-        const __m512 low = (__m512)load(p), high = (__m512)load(p + LANES);
-        return {(Floats)_mm512_permutex2var_ps(low, (__m512i)places, high),
-                (Floats)_mm512_permutex2var_ps(low, (__m512i)(places + 1), high)};
-    }
-};
-
 // One variable of 32 classes without its largest logit and with half the sums: where exp can hold all of its logits, as almost
 // always. -1: not here.
 template <class T>
@@ -81,7 +66,10 @@ template <class T>
     }
     const __m512 farthest = _mm512_range_ps((__m512)even, (__m512)odd, 0b1011);  // the larger one without its sign
     if (_mm512_cmp_ps_mask(farthest, _mm512_set1_ps(80.0f), _CMP_GT_OQ)) return -1;
-    even = quick_exp(even), odd = quick_exp(odd);
+    if (probs)
+        even = quick_exp(even), odd = quick_exp(odd);
+    else
+        even = quick_exp_of<T>(even), odd = quick_exp_of<T>(odd);
     const Floats cdf = running_sum(even + odd), total = last(cdf), bound = total * uniform;
     const uint32_t found = where_greater(cdf, bound);
     if (!found) return -1;

@@ -36,7 +36,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
         uint16_t* operand = (uint16_t*)memory;
         T* lines = (T*)(memory + laid_bytes);
         T* results = (T*)(memory + laid_bytes + row_bytes);
-        alignas(64) float sums[2][4 * TILE * TILE] = {};
+        alignas(64) float sums[2][PANEL * PANEL] = {};
         Behind<T> its = behind;
         if (pixels) its.out = results;
         Tiles tiles;
@@ -58,7 +58,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                     if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
                 };
                 zero_sums();
-                add_steps<PARTS<T>>(height(b) > TILE, outputs - p * PANEL > TILE, left, weights + p * panel, steps, turn % 2, meanwhile);
+                add_steps<PARTS<T>, RIGHT_STAYS>(height(b) > TILE, outputs - p * PANEL > TILE, left, weights + p * panel, steps, turn % 2, meanwhile);
                 store_sums(sums[turn % 2]);
             }
             write(panels * all - 1, 0, PANEL);
@@ -123,7 +123,7 @@ static void places_by_weights(const Windows<T>& windows, Index images, const uin
         uint16_t* operand = (uint16_t*)memory;
         T* lines = (T*)(memory + laid_bytes);
         T* results = (T*)(memory + laid_bytes + row_bytes);
-        alignas(64) float sums[2][4 * TILE * TILE] = {};
+        alignas(64) float sums[2][PANEL * PANEL] = {};
         Place<T> here[8];
         Behind<T> its = behind;
         its.out = results;
@@ -147,9 +147,9 @@ static void places_by_weights(const Windows<T>& windows, Index images, const uin
                     const Index s = turn % 2 ? count - 1 - i : i;
                     const uint16_t* right = weights + p * panel + here[b].which[s] * 2 * PARTS<T> * NUMBERS;
                     if (outputs - p * PANEL > TILE)
-                        add_step<PARTS<T>>(left, s * left.step, right);
+                        add_step<PARTS<T>, RIGHT_STAYS>(left, s * left.step, right);
                     else
-                        add_some_step<PARTS<T>, 2, 1>(left, s * left.step, right);
+                        add_some_step<PARTS<T>, RIGHT_STAYS, 2, 1>(left, s * left.step, right);
                     if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
                 }
                 if (turn > 0 && count == 0) write(turn - 1, 0, PANEL);
@@ -180,7 +180,7 @@ static void lines_by_weights(const Windows<BF16>& windows, Index images, const u
         char* memory = (char*)scratch.get(laid_bytes + at_once * PANEL * outputs * sizeof(BF16));
         std::memset(memory, 0, laid_bytes);
         BF16 *lines = (BF16*)memory, *results = (BF16*)(memory + laid_bytes);
-        alignas(64) float sums[2][4 * TILE * TILE] = {};
+        alignas(64) float sums[2][PANEL * PANEL] = {};
         Behind<BF16> its = behind;
         if (pixels) its.out = results;
         Tiles tiles;
@@ -208,9 +208,9 @@ static void lines_by_weights(const Windows<BF16>& windows, Index images, const u
                 for (Index row = 0, s = 0; row < windows.kernel_height; row++) {
                     for (Index i = 0; i < piece; i++, s++) {
                         if (outputs - p * PANEL > TILE)
-                            add_step<1>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
+                            add_step<1, RIGHT_STAYS>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
                         else
-                            add_some_step<1, 2, 1>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
+                            add_some_step<1, RIGHT_STAYS, 2, 1>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
                         if (turn > 0 && s * share < PANEL) write(turn - 1, s * share, (s + 1) * share);
                     }
                 }

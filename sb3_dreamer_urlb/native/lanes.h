@@ -1,6 +1,8 @@
 // What kernels need of sixteen numbers besides vectors.h: some of them, sums of lanes, exponentials and what is made of them.
 #pragma once
 
+#include <type_traits>
+
 #include "activation.h"
 
 // The first `count` lanes, 0 in the others; 16 or more: all.
@@ -115,6 +117,15 @@ static inline Floats quick_exp(Floats x) {
 #endif
 }
 
+// The same as exactly as numbers of a format need it.
+template <class T>
+static inline Floats quick_exp_of(Floats x) {
+#ifdef __AVX512DQ__
+    if constexpr (std::is_same_v<T, BF16>) return coarse_power_of_two(x * 1.44269504f);
+#endif
+    return quick_exp(x);
+}
+
 // exp(x) where x ≤ 0, but 0 below -87: what cannot be must not be drawn. What is not a number stays so.
 static inline Floats exp_or_zero(Floats x) {
 #ifdef __AVX512DQ__
@@ -124,8 +135,12 @@ static inline Floats exp_or_zero(Floats x) {
 #endif
 }
 
-// 1 / (1 + exp(x)); exp stays what it is at 80 beyond.
+// 1 / (1 + exp(x)); exp stays what it is at 80 beyond. `T`: the format of what x was made of, which says how exact it need be.
+template <class T>
 static inline Floats reciprocal_of_one_plus_exp(Floats x) {
+#ifdef __AVX512DQ__
+    if constexpr (std::is_same_v<T, BF16>) return (Floats)_mm512_rcp14_ps((__m512)(coarse_power_of_two(x * 1.44269504f) + 1.0f));
+#endif
     x = x > 80.0f ? all(80.0f) : x;
 #ifdef __AVX512DQ__
     const Floats y = power_of_two(x * 1.44269504f, 0xffff) + 1.0f, z = (Floats)_mm512_rcp14_ps((__m512)y);
@@ -135,5 +150,28 @@ static inline Floats reciprocal_of_one_plus_exp(Floats x) {
 #endif
 }
 
-static inline Floats sigmoid(Floats x) { return reciprocal_of_one_plus_exp(-x); }
-static inline Floats tanh(Floats x) { return 1.0f - 2.0f * reciprocal_of_one_plus_exp(x + x); }
+template <class T>
+static inline Floats sigmoid(Floats x) {
+    return reciprocal_of_one_plus_exp<T>(-x);
+}
+template <class T>
+static inline Floats tanh(Floats x) {
+    return 1.0f - 2.0f * reciprocal_of_one_plus_exp<T>(x + x);
+}
+
+#ifdef __AVX512DQ__
+// Thirty-two numbers, those at even places and those at odd ones.
+struct Pairs {
+    Floats even, odd;
+    static Pairs from(const BF16* p) { return from(read<__m512i>(p)); }
+    static Pairs from(__m512i both) {
+        return {(Floats)_mm512_slli_epi32(both, 16), (Floats)_mm512_and_si512(both, _mm512_set1_epi32(0xffff0000))};
+    }
+    static Pairs from(const float* p) {
+        const Ints places = {0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30};
+        const __m512 low = (__m512)load(p), high = (__m512)load(p + LANES);
+        return {(Floats)_mm512_permutex2var_ps(low, (__m512i)places, high),
+                (Floats)_mm512_permutex2var_ps(low, (__m512i)(places + 1), high)};
+    }
+};
+#endif

@@ -4,14 +4,20 @@
 
 #include <vector>
 
-// parts (rows, 3 · size), old (rows, size) → deter (rows, size), and the same in T, its rows short_stride apart; null for none.
+// parts (rows, 3 · size), old (rows, size) → deter (rows, size), and the same in T, its rows short_stride apart; null for none. Who
+// asks for T gets both as exactly as T needs.
 template <class T>
 static void gates(const T* parts, const float* weight, const float* bias, float epsilon, const float* old, float* deter, T* shorter,
                   Index short_stride, Index rows, Index size, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(static) if (rows * size > WORTH_A_THREAD / 4)
     for (Index r = 0; r < rows; r++) {
-        gates_of_row(parts + r * 3 * size, weight, bias, epsilon, old + r * size, deter + r * size,
-                     shorter ? shorter + r * short_stride : nullptr, size);
+        const auto work = [=](auto* its) {
+            gates_of_row(parts + r * 3 * size, weight, bias, epsilon, old + r * size, deter + r * size, its, size);
+        };
+        if (shorter)
+            work(shorter + r * short_stride);
+        else
+            work((float*)nullptr);
     }
 }
 
@@ -25,7 +31,7 @@ static void gates_backward(const float* grad, const T* parts, const float* weigh
 #pragma omp for schedule(static)
         for (Index r = 0; r < rows; r++) {
             const T* row = parts + r * 3 * size;
-            const Norm norm = norm_of(row, 3 * size, epsilon);
+            const Norm norm = norm_of<float>(row, 3 * size, epsilon);
             Floats sums = all(0), products = all(0);
             // Of the normed number · its weight; and what the norm's gradient needs to know of all of them.
             auto put = [&](Index i, Index at, Floats g) {
@@ -35,7 +41,7 @@ static void gates_backward(const float* grad, const T* parts, const float* weigh
                 products += g * (load_up_to(row + at, size - i) - norm.mean) * norm.scale;
             };
             for (Index i = 0; i < size; i += LANES) {
-                const Gates its = Gates::of(row, weight, bias, norm, i, size);
+                const Gates its = Gates::of<float>(row, weight, bias, norm, i, size);
                 const Floats g = load_up_to(grad + r * size + i, size - i), before = load_up_to(old + r * size + i, size - i);
                 store_up_to(old_grad + r * size + i, g * (1.0f - its.update), size - i);
                 const Floats product = g * its.update * (1.0f - its.candidate * its.candidate);  // of reset · input

@@ -246,49 +246,57 @@ struct Left {
         : upper((const uint16_t*)x), lower((const uint16_t*)(x + TILE * stride)), row_bytes(2 * stride), step(DEPTH) {}
 };
 
-// Sums 0 and 1 (upper), 2 and 3 (lower) += left · right, tiles in registers 4 to 7.
-#define MULTIPLY                                                                                                       \
-    _tile_dpbf16ps(0, 4, 6);                                                                                           \
-    _tile_dpbf16ps(1, 4, 7);                                                                                           \
-    _tile_dpbf16ps(2, 5, 6);                                                                                           \
-    _tile_dpbf16ps(3, 5, 7)
-#define LOAD_LEFT(PART)                                                                                                \
-    _tile_loadd(4, a.upper + at + 2 * (PART) * NUMBERS, a.row_bytes);                                          \
-    _tile_loadd(5, a.lower + at + 2 * (PART) * NUMBERS, a.row_bytes)
-#define LOAD_RIGHT(PART)                                                                                               \
-    _tile_loadd(6, b + 2 * (PART) * NUMBERS, 64);                                                                      \
-    _tile_loadd(7, b + (2 * (PART) + 1) * NUMBERS, 64)
+// The right operand stays in the nearest cache; or it passes it by, so that the left one stays.
+enum Nearest { RIGHT_STAYS, LEFT_STAYS };
+
+// A macro, because an instruction names its register.
+#define LOAD_RIGHT(REGISTER, FROM)                                                                                     \
+    if constexpr (nearest == LEFT_STAYS) {                                                                             \
+        _tile_stream_loadd(REGISTER, FROM, 64);                                                                        \
+    } else {                                                                                                           \
+        _tile_loadd(REGISTER, FROM, 64);                                                                               \
+    }
+
+// Sums 0 and 1 (upper), 2 and 3 (lower) += one part of a step of the left · one of the right, tiles in registers 4 to 7; each is
+// loaded, where it is not there yet, just before it is needed.
+template <Nearest nearest, bool load_left, bool load_right>
+static inline void multiply(const Left& a, Index at, const uint16_t* b) {
+    if constexpr (load_right) { LOAD_RIGHT(6, b) }
+    if constexpr (load_left) _tile_loadd(4, a.upper + at, a.row_bytes);
+    _tile_dpbf16ps(0, 4, 6);
+    if constexpr (load_left) _tile_loadd(5, a.lower + at, a.row_bytes);
+    _tile_dpbf16ps(2, 5, 6);
+    if constexpr (load_right) { LOAD_RIGHT(7, b + NUMBERS) }
+    _tile_dpbf16ps(1, 4, 7);
+    _tile_dpbf16ps(3, 5, 7);
+}
 
 // The 32×32 sums in registers 0 to 3 += one step of the left · one of the right.
-template <int parts>
+template <int parts, Nearest nearest>
 static inline void add_step(const Left& a, Index at, const uint16_t* b) {
-    LOAD_LEFT(0);
-    LOAD_RIGHT(0);
-    MULTIPLY;
-    if (parts == 3) {
-        LOAD_RIGHT(2);
-        MULTIPLY;
-        LOAD_RIGHT(1);
-        MULTIPLY;
-        LOAD_LEFT(1);
-        MULTIPLY;
-        LOAD_RIGHT(0);
-        MULTIPLY;
-        LOAD_LEFT(2);
-        MULTIPLY;
+    constexpr Index PART = 2 * NUMBERS;
+    if constexpr (parts == 1) {
+        multiply<nearest, true, true>(a, at, b);
+    } else {
+        multiply<RIGHT_STAYS, true, true>(a, at, b);
+        multiply<RIGHT_STAYS, false, true>(a, at, b + 2 * PART);
+        multiply<RIGHT_STAYS, false, true>(a, at, b + PART);
+        multiply<RIGHT_STAYS, true, false>(a, at + PART, b);
+        multiply<RIGHT_STAYS, false, true>(a, at, b);
+        multiply<RIGHT_STAYS, true, false>(a, at + 2 * PART, b);
     }
 }
 
 // The same where there are fewer rows (tall: 1 for 16) or columns (wide).
-template <int parts, int tall, int wide>
+template <int parts, Nearest nearest, int tall, int wide>
 static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
     for (int left = 0; left < parts; left++) {
         _tile_loadd(4, a.upper + at + 2 * left * NUMBERS, a.row_bytes);
         if (tall == 2) _tile_loadd(5, a.lower + at + 2 * left * NUMBERS, a.row_bytes);
         for (int i = 0; i < parts - left; i++) {
             const int right = left == 0 ? (parts - i) % parts : parts - left - 1 - i;  // the order of whole steps
-            _tile_loadd(6, b + 2 * right * NUMBERS, 64);
-            if (wide == 2) _tile_loadd(7, b + (2 * right + 1) * NUMBERS, 64);
+            LOAD_RIGHT(6, b + 2 * right * NUMBERS)
+            if (wide == 2) { LOAD_RIGHT(7, b + (2 * right + 1) * NUMBERS) }
             _tile_dpbf16ps(0, 4, 6);
             if (wide == 2) _tile_dpbf16ps(1, 4, 7);
             if (tall == 2) _tile_dpbf16ps(2, 5, 6);
@@ -297,42 +305,42 @@ static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
     }
 }
 
-// All steps. Who goes backwards every other time finds what was read last in the nearest cache. Between the steps goes on
-// what else there is to do: tiles are multiplied beside it.
-template <int parts, int tall = 2, int wide = 2, class Meanwhile>
+// All steps. Between them goes on what else there is to do: tiles are multiplied beside it.
+template <int parts, Nearest nearest, int tall, int wide, class Meanwhile>
 static inline void add_steps(const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
     for (Index i = 0; i < steps; i++) {
         const Index s = backwards ? steps - 1 - i : i;
-        if (tall == 2 && wide == 2)
-            add_step<parts>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+        if constexpr (tall == 2 && wide == 2)
+            add_step<parts, nearest>(a, s * a.step, b + s * 2 * parts * NUMBERS);
         else
-            add_some_step<parts, tall, wide>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+            add_some_step<parts, nearest, tall, wide>(a, s * a.step, b + s * 2 * parts * NUMBERS);
         meanwhile(i);
     }
 }
-template <int parts, class Meanwhile>
+template <int parts, Nearest nearest, class Meanwhile>
 static inline void add_steps(bool tall, bool wide, const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
     if (tall && wide)
-        add_steps<parts>(a, b, steps, backwards, meanwhile);
+        add_steps<parts, nearest, 2, 2>(a, b, steps, backwards, meanwhile);
     else if (tall)
-        add_steps<parts, 2, 1>(a, b, steps, backwards, meanwhile);
+        add_steps<parts, nearest, 2, 1>(a, b, steps, backwards, meanwhile);
     else if (wide)
-        add_steps<parts, 1, 2>(a, b, steps, backwards, meanwhile);
+        add_steps<parts, nearest, 1, 2>(a, b, steps, backwards, meanwhile);
     else
-        add_steps<parts, 1, 1>(a, b, steps, backwards, meanwhile);
+        add_steps<parts, nearest, 1, 1>(a, b, steps, backwards, meanwhile);
 }
 
+// The 32×32 sums in memory, row by row.
 static inline void load_sums(const float* c) {
-    _tile_loadd(0, c, 64);
-    _tile_loadd(1, c + TILE * TILE, 64);
-    _tile_loadd(2, c + 2 * TILE * TILE, 64);
-    _tile_loadd(3, c + 3 * TILE * TILE, 64);
+    _tile_loadd(0, c, 4 * PANEL);
+    _tile_loadd(1, c + TILE, 4 * PANEL);
+    _tile_loadd(2, c + TILE * PANEL, 4 * PANEL);
+    _tile_loadd(3, c + TILE * PANEL + TILE, 4 * PANEL);
 }
 static inline void store_sums(float* c) {
-    _tile_stored(0, c, 64);
-    _tile_stored(1, c + TILE * TILE, 64);
-    _tile_stored(2, c + 2 * TILE * TILE, 64);
-    _tile_stored(3, c + 3 * TILE * TILE, 64);
+    _tile_stored(0, c, 4 * PANEL);
+    _tile_stored(1, c + TILE, 4 * PANEL);
+    _tile_stored(2, c + TILE * PANEL, 4 * PANEL);
+    _tile_stored(3, c + TILE * PANEL + TILE, 4 * PANEL);
 }
 static inline void zero_sums() {
     _tile_zero(0);

@@ -99,7 +99,7 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
                         load_sums(sum);
                     else
                         zero_sums();
-                    add_steps<PARTS<T>>(m - i > TILE, now.columns - j > TILE, Left(now.laid_left + i / PANEL * panel, PARTS<T>),
+                    add_steps<PARTS<T>, LEFT_STAYS>(m - i > TILE, now.columns - j > TILE, Left(now.laid_left + i / PANEL * panel, PARTS<T>),
                                         now.laid_right + j / PANEL * panel, steps, j / PANEL % 2, meanwhile);
                     store_sums(sum);
                 }
@@ -115,7 +115,7 @@ static inline void gather_row(const float* sums, Index i, Index m, Index n, Inde
     for (Index j = 0; j < n; j += TILE) {
         const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
         const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
-        const float* at = sums + block + ((i / TILE % 2 * 2 + j / TILE % 2) * TILE + i % TILE) * TILE;
+        const float* at = sums + block + i % PANEL * PANEL + j % PANEL;
         Floats total = load(at);
         for (Index t = 1; t < threads; t++) total += load(at + t * size);
         _mm512_mask_storeu_ps(row + j, first(least(n - j, TILE)), (__m512)total);
