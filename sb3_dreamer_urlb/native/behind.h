@@ -48,7 +48,8 @@ template <class T, class Following>
 static inline void block_by_weights(const Left& left, const uint16_t* weights, Index steps, Index outputs, Index r, Index height,
                                     const Following& behind) {
     alignas(64) float sums[PANEL * PANEL];
-    const Index panels = (outputs + PANEL - 1) / PANEL, least_share = (height + steps - 1) / steps, share = least_share < 3 ? 3 : least_share;
+    const Index panels = (outputs + PANEL - 1) / PANEL, products = steps * PRODUCTS<PARTS<T>>;
+    const Index least_share = (height + products - 1) / products, share = PARTS<T> == 1 && least_share < 3 ? 3 : least_share;
     for (Index p = 0; p < panels; p++) {
         zero_sums();
         add_steps<PARTS<T>, LEFT_STAYS>(height > TILE, outputs - p * PANEL > TILE, left, weights + p * steps * 2 * PARTS<T> * NUMBERS,

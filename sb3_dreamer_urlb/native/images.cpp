@@ -50,7 +50,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
                 const Index p = turn / all, b = turn % all;
                 its(sums[turn % 2], here + b * PANEL, p * PANEL, begin, least(end, height(b)), least(outputs - p * PANEL, PANEL));
             };
-            const Index share = (PANEL + steps - 1) / steps;
+            const Index products = steps * PRODUCTS<PARTS<T>>, share = (PANEL + products - 1) / products;
             for (Index turn = 0; turn < panels * all; turn++) {
                 const Index p = turn / all, b = turn % all;
                 const Left left = laid_out(operand + b * laid, stride, (T*)nullptr);
@@ -140,17 +140,22 @@ static void places_by_weights(const Windows<T>& windows, Index images, const uin
                 its(sums[turn % 2], b * PANEL, p * PANEL, begin, least(end, PANEL), least(outputs - p * PANEL, PANEL));
             };
             for (Index turn = 0; turn < panels * all; turn++) {
-                const Index p = turn / all, b = turn % all, count = here[b].steps, share = (PANEL + count) / most(count, 1);
+                const Index p = turn / all, b = turn % all, count = here[b].steps;
+                const Index products = most(count * PRODUCTS<PARTS<T>>, 1), share = (PANEL + products - 1) / products;
                 const Left left = laid_out(operand + b * laid, stride, (T*)nullptr);
+                Index done = 0;
+                const auto meanwhile = [&] {
+                    if (turn > 0 && done < PANEL) write(turn - 1, done, done + share);
+                    done += share;
+                };
                 zero_sums();
                 for (Index i = 0; i < count; i++) {
                     const Index s = turn % 2 ? count - 1 - i : i;
                     const uint16_t* right = weights + p * panel + here[b].which[s] * 2 * PARTS<T> * NUMBERS;
                     if (outputs - p * PANEL > TILE)
-                        add_step<PARTS<T>, RIGHT_STAYS>(left, s * left.step, right);
+                        add_step<PARTS<T>, RIGHT_STAYS>(left, s * left.step, right, meanwhile);
                     else
-                        add_some_step<PARTS<T>, RIGHT_STAYS, 2, 1>(left, s * left.step, right);
-                    if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
+                        add_some_step<PARTS<T>, RIGHT_STAYS, 2, 1>(left, s * left.step, right, meanwhile);
                 }
                 if (turn > 0 && count == 0) write(turn - 1, 0, PANEL);
                 store_sums(sums[turn % 2]);
@@ -204,14 +209,19 @@ static void lines_by_weights(const Windows<BF16>& windows, Index images, const u
             for (Index turn = 0; turn < panels * all; turn++) {
                 const Index p = turn / all, b = turn % all;
                 const Left left((const BF16*)lines + b * laid, apart);
+                const uint16_t* right = weights + p * panel;
+                Index done = 0;
+                const auto meanwhile = [&] {
+                    if (turn > 0 && done < PANEL) write(turn - 1, done, done + share);
+                    done += share;
+                };
                 zero_sums();
-                for (Index row = 0, s = 0; row < windows.kernel_height; row++) {
-                    for (Index i = 0; i < piece; i++, s++) {
+                for (Index row = 0; row < windows.kernel_height; row++) {
+                    for (Index i = 0; i < piece; i++, right += 2 * NUMBERS) {
                         if (outputs - p * PANEL > TILE)
-                            add_step<1, RIGHT_STAYS>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
+                            add_step<1, RIGHT_STAYS>(left, row * line + i * DEPTH, right, meanwhile);
                         else
-                            add_some_step<1, RIGHT_STAYS, 2, 1>(left, row * line + i * DEPTH, weights + p * panel + s * 2 * NUMBERS);
-                        if (turn > 0 && s * share < PANEL) write(turn - 1, s * share, (s + 1) * share);
+                            add_some_step<1, RIGHT_STAYS, 2, 1>(left, row * line + i * DEPTH, right, meanwhile);
                     }
                 }
                 store_sums(sums[turn % 2]);

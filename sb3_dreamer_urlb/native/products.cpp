@@ -25,7 +25,7 @@ static void lay_out_weights(const T* weight, Index stride, Index outputs, Index 
     for (Index p = 0; p < panels; p++) {
         const Index some = least(outputs - p * PANEL, PANEL);
         if (by_depth)
-            lay_out_by_depth<RIGHT>(weight + p * PANEL, stride, some, depth, out + p * panel);
+            lay_out_by_depth(weight + p * PANEL, stride, some, depth, out + p * panel);
         else
             lay_out_right(weight + p * PANEL * stride, stride, some, depth, out + p * panel);
     }

@@ -93,19 +93,31 @@ static inline void row(const float* p, __mmask32 mask, __m512i parts[]) {
     split(_mm512_maskz_loadu_ps(mask, p), _mm512_maskz_loadu_ps(mask >> 16, p + 16), parts);
 }
 
-// The same from several places: `masks` says which numbers come from which.
-template <class Start>
-static inline void row(const BF16* p, const Start& starts, const __mmask32* masks, int count, __m512i parts[]) {
+// Where 32 columns of a row are: those of each mask from a place of their own.
+struct Columns {
+    int pieces = 0;
+    Index starts[PANEL] = {};
+    __mmask32 masks[PANEL] = {};
+
+    void add(Index start, Index begin, Index end) {
+        starts[pieces] = start, masks[pieces] = first(end) & ~first(begin);
+        pieces++;
+    }
+};
+
+// The same from several places, `most` of them or, if that is 0, as many as there are.
+template <int most>
+static inline void row(const BF16* p, const Columns& its, __m512i parts[]) {
     __m512i x = _mm512_setzero_si512();
-    for (int i = 0; i < count; i++) x = _mm512_mask_loadu_epi16(x, masks[i], p + starts[i]);
+    for (int i = 0; i < (most ? most : its.pieces); i++) x = _mm512_mask_loadu_epi16(x, its.masks[i], p + its.starts[i]);
     parts[0] = x;
 }
-template <class Start>
-static inline void row(const float* p, const Start& starts, const __mmask32* masks, int count, __m512i parts[]) {
+template <int most>
+static inline void row(const float* p, const Columns& its, __m512i parts[]) {
     __m512 low = _mm512_setzero_ps(), high = low;
-    for (int i = 0; i < count; i++) {
-        low = _mm512_mask_loadu_ps(low, masks[i], p + starts[i]);
-        high = _mm512_mask_loadu_ps(high, masks[i] >> 16, p + starts[i] + 16);
+    for (int i = 0; i < (most ? most : its.pieces); i++) {
+        low = _mm512_mask_loadu_ps(low, its.masks[i], p + its.starts[i]);
+        high = _mm512_mask_loadu_ps(high, its.masks[i] >> 16, p + its.starts[i] + 16);
     }
     split(low, high, parts);
 }
@@ -143,39 +155,28 @@ static inline void store_two(BF16* p, Two x, __mmask32 mask) {
     _mm512_mask_storeu_epi16(p, some ? mask : ~0u, (__m512i)_mm512_cvtne2ps_pbh((__m512)x.high, (__m512)x.low));
 }
 
-enum Side { LEFT, RIGHT };
-
-// Two tiles of a matrix (depth, across), next to each other; `read` gives the parts of row j. `whole`: 32 rows.
-template <Side side, class T, bool whole, class Read>
-static inline void lay_tiles(Read read, Index depth, uint16_t* out) {
-    __m512i p[PARTS<T>] = {}, q[PARTS<T>] = {}, tiles[PARTS<T>][2][TILE];
-    for (Index j = 0; j < TILE; j++) {
-        if (whole || 2 * j < depth) read(2 * j, p);
-        if (whole || 2 * j + 1 < depth) read(2 * j + 1, q);
+// Rows 2j and 2j + 1 of 32 columns, for j from `begin` to `end`, in the two tiles next to each other of a right operand; `read` gives
+// the parts of a row. Rows from `depth` on are zeros.
+template <class T, class Read>
+static inline void lay_pairs(Read read, Index depth, Index begin, Index end, uint16_t* out) {
+    for (Index j = begin; j < end; j++) {
+        __m512i p[PARTS<T>] = {}, q[PARTS<T>] = {}, low, high;
+        if (2 * j < depth) read(2 * j, p);
+        if (2 * j + 1 < depth) read(2 * j + 1, q);
         for (int i = 0; i < PARTS<T>; i++) {
-            if (!whole && 2 * j >= depth) p[i] = _mm512_setzero_si512();
-            if (!whole && 2 * j + 1 >= depth) q[i] = _mm512_setzero_si512();
-            interleave(p[i], q[i], tiles[i][0][j], tiles[i][1][j]);
-        }
-    }
-    for (int i = 0; i < PARTS<T>; i++) {
-        for (int half = 0; half < 2; half++, out += NUMBERS) {
-            if (side == LEFT) transpose(tiles[i][half]);
-            for (Index j = 0; j < TILE; j++) _mm512_store_si512(out + j * DEPTH, tiles[i][half][j]);
+            interleave(p[i], q[i], low, high);
+            _mm512_store_si512(out + 2 * i * NUMBERS + j * DEPTH, low);
+            _mm512_store_si512(out + (2 * i + 1) * NUMBERS + j * DEPTH, high);
         }
     }
 }
-template <Side side, class T, class Read>
-static inline void lay_tiles(Read read, Index depth, uint16_t* out) {
-    if (depth >= DEPTH)
-        lay_tiles<side, T, true>(read, depth, out);
-    else
-        lay_tiles<side, T, false>(read, depth, out);
-}
-template <Side side, class T>
-static inline void lay_tiles_by_depth(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
-    const __mmask32 mask = first(across);
-    lay_tiles<side, T>([=](Index j, __m512i* parts) { row(x + j * stride, mask, parts); }, depth, out);
+
+// A right operand's tile as the left operand's, with the same columns as its rows.
+static inline void transpose_tile(uint16_t* tile) {
+    __m512i x[TILE];
+    for (Index j = 0; j < TILE; j++) x[j] = _mm512_load_si512(tile + j * DEPTH);
+    transpose(x);
+    for (Index j = 0; j < TILE; j++) _mm512_store_si512(tile + j * DEPTH, x[j]);
 }
 
 // One tile of x (across, depth), as the right operand.
@@ -198,14 +199,16 @@ static inline uint16_t* tile_of(uint16_t* out, Index across, Index step, Index s
     return out + ((across / PANEL * steps + step) * PARTS<T> * 2 + across / TILE % 2) * NUMBERS;
 }
 
-// x (depth, across), rows `stride` apart.
-template <Side side, class T>
+// x (depth, across), rows `stride` apart, as the right operand.
+template <class T>
 static void lay_out_by_depth(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
     const Index steps = steps_of(depth);
     for (Index s = 0; s < steps; s++) {
         for (Index a = 0; a < across; a += PANEL) {
             const T* corner = x + s * DEPTH * stride + a;
-            lay_tiles_by_depth<side>(corner, stride, across - a, depth - s * DEPTH, tile_of<T>(out, a, s, steps));
+            const __mmask32 mask = first(across - a);
+            lay_pairs<T>([=](Index j, __m512i* parts) { row(corner + j * stride, mask, parts); }, depth - s * DEPTH, 0, TILE,
+                         tile_of<T>(out, a, s, steps));
         }
     }
 }
@@ -271,25 +274,36 @@ static inline void multiply(const Left& a, Index at, const uint16_t* b) {
     _tile_dpbf16ps(3, 5, 7);
 }
 
-// The 32×32 sums in registers 0 to 3 += one step of the left · one of the right.
-template <int parts, Nearest nearest>
-static inline void add_step(const Left& a, Index at, const uint16_t* b) {
+// Products of parts that make one of numbers.
+template <int parts>
+constexpr Index PRODUCTS = parts * (parts + 1) / 2;
+
+// The 32×32 sums in registers 0 to 3 += one step of the left · one of the right. After each product of parts goes on what else there
+// is to do: tiles are multiplied beside it, as long as it is little at a time.
+template <int parts, Nearest nearest, class Meanwhile>
+static inline void add_step(const Left& a, Index at, const uint16_t* b, Meanwhile meanwhile) {
     constexpr Index PART = 2 * NUMBERS;
     if constexpr (parts == 1) {
         multiply<nearest, true, true>(a, at, b);
     } else {
         multiply<RIGHT_STAYS, true, true>(a, at, b);
+        meanwhile();
         multiply<RIGHT_STAYS, false, true>(a, at, b + 2 * PART);
+        meanwhile();
         multiply<RIGHT_STAYS, false, true>(a, at, b + PART);
+        meanwhile();
         multiply<RIGHT_STAYS, true, false>(a, at + PART, b);
+        meanwhile();
         multiply<RIGHT_STAYS, false, true>(a, at, b);
+        meanwhile();
         multiply<RIGHT_STAYS, true, false>(a, at + 2 * PART, b);
     }
+    meanwhile();
 }
 
 // The same where there are fewer rows (tall: 1 for 16) or columns (wide).
-template <int parts, Nearest nearest, int tall, int wide>
-static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
+template <int parts, Nearest nearest, int tall, int wide, class Meanwhile>
+static inline void add_some_step(const Left& a, Index at, const uint16_t* b, Meanwhile meanwhile) {
     for (int left = 0; left < parts; left++) {
         _tile_loadd(4, a.upper + at + 2 * left * NUMBERS, a.row_bytes);
         if (tall == 2) _tile_loadd(5, a.lower + at + 2 * left * NUMBERS, a.row_bytes);
@@ -301,20 +315,22 @@ static inline void add_some_step(const Left& a, Index at, const uint16_t* b) {
             if (wide == 2) _tile_dpbf16ps(1, 4, 7);
             if (tall == 2) _tile_dpbf16ps(2, 5, 6);
             if (tall == 2 && wide == 2) _tile_dpbf16ps(3, 5, 7);
+            meanwhile();
         }
     }
 }
 
-// All steps. Between them goes on what else there is to do: tiles are multiplied beside it.
+// All steps; meanwhile(i) counts products of parts.
 template <int parts, Nearest nearest, int tall, int wide, class Meanwhile>
 static inline void add_steps(const Left& a, const uint16_t* b, Index steps, bool backwards, Meanwhile meanwhile) {
+    Index products = 0;
+    const auto work = [&] { meanwhile(products++); };
     for (Index i = 0; i < steps; i++) {
         const Index s = backwards ? steps - 1 - i : i;
         if constexpr (tall == 2 && wide == 2)
-            add_step<parts, nearest>(a, s * a.step, b + s * 2 * parts * NUMBERS);
+            add_step<parts, nearest>(a, s * a.step, b + s * 2 * parts * NUMBERS, work);
         else
-            add_some_step<parts, nearest, tall, wide>(a, s * a.step, b + s * 2 * parts * NUMBERS);
-        meanwhile(i);
+            add_some_step<parts, nearest, tall, wide>(a, s * a.step, b + s * 2 * parts * NUMBERS, work);
     }
 }
 template <int parts, Nearest nearest, class Meanwhile>

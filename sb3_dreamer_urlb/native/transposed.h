@@ -17,43 +17,71 @@ struct PlainRows {
     void find(Index r, Index count, const T** rows) const {
         for (Index i = 0; i < count; i++) rows[i] = x + (r + i) * stride;
     }
-    // Columns from c on of up to 32 of these rows.
-    void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
-        const __mmask32 mask = first(columns);
-        lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j] + c, mask, parts); }, count, out);
+    // Up to 32 columns from c on.
+    Columns columns(Index c, Index count) const {
+        Columns its;
+        its.add(c, 0, count);
+        return its;
     }
 };
 
-// Some rows and columns of both operands, laid out piece by piece, 32 rows × 32 columns each: the left one's first.
+// Some rows and columns of both operands, laid out bit by bit, so that each bit finds its place beside tiles that are multiplied.
+// A piece is 32 rows × 32 columns; the left one's come first.
 template <class T, class Right>
-struct Piece {
+struct Pieces {
+    static constexpr Index PAIRS = PARTS<T> == 1 ? 4 : 1;   // of rows, a bit
+    static constexpr Index RIGHT_BITS = TILE / PAIRS, LEFT_BITS = RIGHT_BITS + 2 * PARTS<T>;  // of a piece; the left one's tiles are transposed
+
     const T* left;
     Index left_stride, m;
     const Right* right;
-    Index begin, count, c, columns;
+    Index begin, count, columns;
     const T* rows[ROWS];
+    Columns places[COLUMNS / PANEL];
     uint16_t *laid_left, *laid_right;
-    Index step = 0, across = 0;
+    Index step = 0, across = 0, bit = 0;
     bool at_right = false;
 
-    void start(Index its_begin, Index its_count, Index its_c, Index its_columns) {
-        begin = its_begin, count = its_count, c = its_c, columns = its_columns;
-        step = across = 0, at_right = false;
+    void start(Index its_begin, Index its_count, Index c, Index its_columns) {
+        begin = its_begin, count = its_count, columns = its_columns;
+        step = across = bit = 0, at_right = false;
         right->find(begin, count, rows);
+        for (Index a = 0; a < columns; a += PANEL) places[a / PANEL] = right->columns(c + a, least(columns - a, PANEL));
     }
-    Index pieces() const { return steps_of(count) * (up_to(m, PANEL) + up_to(columns, PANEL)) / PANEL; }
-    void lay_out_one() {
-        const Index steps = steps_of(count), r = step * DEPTH, some = least(count - r, DEPTH);
+    Index bits() const {
+        return steps_of(count) * (up_to(m, PANEL) / PANEL * LEFT_BITS + up_to(columns, PANEL) / PANEL * RIGHT_BITS);
+    }
+    void lay_out_a_bit() {
+        const Index steps = steps_of(count), r = step * DEPTH;
+        uint16_t* const out = tile_of<T>(at_right ? laid_right : laid_left, across, step, steps);
         if (at_right)
-            right->lay_out(rows + r, some, c + across, columns - across, tile_of<T>(laid_right, across, step, steps));
+            lay_right(rows + r, places[across / PANEL], count - r, out);
+        else if (bit < RIGHT_BITS)
+            lay_left(left + (begin + r) * left_stride + across, first(m - across), count - r, out);
         else
-            lay_tiles_by_depth<LEFT>(left + (begin + r) * left_stride + across, left_stride, m - across, some,
-                                     tile_of<T>(laid_left, across, step, steps));
-        across += PANEL;
-        if (across >= (at_right ? columns : m)) {
-            across = 0;
-            if (++step == steps) step = 0, at_right = true;
-        }
+            transpose_tile(out + (bit - RIGHT_BITS) * NUMBERS);
+        if (++bit < (at_right ? RIGHT_BITS : LEFT_BITS)) return;
+        bit = 0, across += PANEL;
+        if (across < (at_right ? columns : m)) return;
+        across = 0;
+        if (++step == steps) step = 0, at_right = true;
+    }
+
+  private:
+    void lay_left(const T* x, __mmask32 mask, Index depth, uint16_t* out) const {
+        lay([=](Index j, __m512i* parts) { row(x + j * left_stride, mask, parts); }, depth, out);
+    }
+    void lay_right(const T* const* x, const Columns& its, Index depth, uint16_t* out) const {
+        if (its.pieces == 1)
+            lay([=, start = its.starts[0], mask = its.masks[0]](Index j, __m512i* parts) { row(x[j] + start, mask, parts); }, depth, out);
+        else if (its.pieces <= 4)
+            lay([=, &its](Index j, __m512i* parts) { row<4>(x[j], its, parts); }, depth, out);
+        else
+            lay([=, &its](Index j, __m512i* parts) { row<0>(x[j], its, parts); }, depth, out);
+    }
+    template <class Read>
+    void lay(Read read, Index depth, uint16_t* out) const {
+        lay_pairs<T>(read, depth, bit * PAIRS, (bit + 1) * PAIRS, out);
     }
 };
 
@@ -68,28 +96,28 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
     const Index size = least(least(up_to(rows, DEPTH), ROWS), fit < 4 * DEPTH ? 4 * DEPTH : fit / DEPTH * DEPTH);
     const Index laid_left = laid_size<T>(m, size), laid = laid_left + laid_size<T>(wide, size);
     uint16_t* memory = (uint16_t*)scratch.get(2 * laid * sizeof(uint16_t));
-    Piece<T, Right> pieces[2];
+    Pieces<T, Right> pieces[2];
     for (int i = 0; i < 2; i++, memory += laid) {
         pieces[i].left = left, pieces[i].left_stride = left_stride, pieces[i].m = m, pieces[i].right = &right;
         pieces[i].laid_left = memory, pieces[i].laid_right = memory + laid_left;
     }
     Tiles tiles;
     pieces[0].start(begin, least(rows, size), 0, wide);
-    for (Index k = pieces[0].pieces(); k > 0; k--) pieces[0].lay_out_one();
+    for (Index k = pieces[0].bits(); k > 0; k--) pieces[0].lay_out_a_bit();
     int turn = 0;
     for (Index c = 0; c < n; c += COLUMNS) {
         for (Index r = 0; r < rows; r += size, turn = 1 - turn) {
-            Piece<T, Right>&now = pieces[turn], &next = pieces[1 - turn];
+            Pieces<T, Right>&now = pieces[turn], &next = pieces[1 - turn];
             const Index steps = steps_of(now.count), panel = steps * 2 * PARTS<T> * NUMBERS;
             Index left_over = 0;
             if (r + size < rows)
-                next.start(begin + r + size, least(rows - r - size, size), c, now.columns), left_over = next.pieces();
+                next.start(begin + r + size, least(rows - r - size, size), c, now.columns), left_over = next.bits();
             else if (c + COLUMNS < n)
-                next.start(begin, least(rows, size), c + COLUMNS, least(n - c - COLUMNS, COLUMNS)), left_over = next.pieces();
-            const Index share = left_over, all = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL) * steps;
+                next.start(begin, least(rows, size), c + COLUMNS, least(n - c - COLUMNS, COLUMNS)), left_over = next.bits();
+            const Index share = left_over, all = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL) * steps * PRODUCTS<PARTS<T>>;
             Index credit = 0;
             const auto meanwhile = [&](Index) {
-                for (credit += share; credit >= all && left_over > 0; credit -= all, left_over--) next.lay_out_one();
+                for (credit += share; credit >= all && left_over > 0; credit -= all, left_over--) next.lay_out_a_bit();
             };
             float* sum = sums + up_to(m, PANEL) * c;
             for (Index i = 0; i < m; i += PANEL) {
@@ -104,7 +132,7 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
                     store_sums(sum);
                 }
             }
-            for (; left_over > 0; left_over--) next.lay_out_one();
+            for (; left_over > 0; left_over--) next.lay_out_a_bit();
         }
     }
 }

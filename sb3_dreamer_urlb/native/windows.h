@@ -105,32 +105,15 @@ struct Windows {
             }
         }
     }
-    void lay_out(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
-        const Index run = kernel_width * channels, line = width * channels, row_of = c / run, at = c - row_of * run;
-        if (at + least(columns, PANEL) <= run) {
-            const Index start = row_of * line + at;
-            const __mmask32 mask = first(columns);
-            lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j] + start, mask, parts); }, count, out);
-        } else if (at + least(columns, PANEL) <= 4 * run) {
-            lay_out_pieces<4>(rows, count, c, least(columns, PANEL), out);
-        } else {
-            lay_out_pieces<PANEL>(rows, count, c, least(columns, PANEL), out);
-        }
-    }
-    template <int most_pieces>
-    void lay_out_pieces(const T** rows, Index count, Index c, Index columns, uint16_t* out) const {
+    Columns columns(Index c, Index count) const {
+        Columns its;
         const Index run = kernel_width * channels, line = width * channels;
-        Index starts[most_pieces] = {};
-        __mmask32 masks[most_pieces] = {};
-        int pieces = 0;
-        for (Index at = 0; at < columns; pieces++) {
-            const Index row_of = (c + at) / run, length = least((row_of + 1) * run - c - at, columns - at);
-            starts[pieces] = row_of * line + c - row_of * run;
-            masks[pieces] = first(at + length) & ~first(at);
-            at += length;
+        for (Index at = 0, end; at < count; at = end) {
+            const Index row_of = (c + at) / run;
+            end = least((row_of + 1) * run - c, count);
+            its.add(row_of * line + c - row_of * run, at, end);
         }
-        if (most_pieces < PANEL) pieces = most_pieces;
-        lay_tiles<RIGHT, T>([=](Index j, __m512i* parts) { row(rows[j], starts, masks, pieces, parts); }, count, out);
+        return its;
     }
 };
 
