@@ -43,22 +43,59 @@ struct Behind {
     }
 };
 
-// 32 rows of the left operand (fewer at the end) · weights laid out. What follows one panel is done while the next is multiplied.
+// Panels of so many rows or columns.
+static inline Index panels_of(Index size) { return (size + PANEL - 1) / PANEL; }
+
+// How often the multiplication of so many rows with weights says `meanwhile`.
+template <class T>
+static inline Index calls_of(Index rows, Index steps, Index outputs) {
+    return panels_of(rows) * panels_of(outputs) * steps * PRODUCTS<PARTS<T>>;
+}
+
+// Rows of the left operand · weights laid out: each panel of weights meets all the rows, 32 at a time, `left(i)` says where the i-th
+// ones are. What follows one product is done while the next is multiplied, and so is what else there is to do. r: where these
+// rows are in the result.
+template <class T, Nearest nearest, class Lefts, class Following, class Meanwhile>
+static inline void blocks_by_weights(Lefts left, Index rows, const uint16_t* weights, Index steps, Index outputs, Index r,
+                                     const Following& behind, Meanwhile meanwhile) {
+    alignas(64) float sums[PANEL * PANEL];
+    const Index products = steps * PRODUCTS<PARTS<T>>, least_share = (PANEL + products - 1) / products;
+    const Index share = PARTS<T> == 1 && least_share < 3 ? 3 : least_share;
+    Index row = 0, column = 0, height = 0, width = 0;  // of the product before
+    bool backwards = false;
+    for (Index c = 0; c < outputs; c += PANEL, weights += steps * 2 * PARTS<T> * NUMBERS) {
+        for (Index i = 0; i < rows; i += PANEL) {
+            zero_sums();
+            // Who goes backwards every other time finds in the nearest cache what was read last.
+            add_steps<PARTS<T>, nearest>(rows - i > TILE, outputs - c > TILE, left(i / PANEL), weights, steps, backwards,
+                                         [=, &behind, &sums, &meanwhile](Index done) {
+                if (done * share < height) behind(sums, r + row, column, done * share, least((done + 1) * share, height), width);
+                meanwhile();
+            });
+            store_sums(sums);
+            row = i, column = c, height = least(rows - i, PANEL), width = least(outputs - c, PANEL);
+            if (nearest == RIGHT_STAYS) backwards = !backwards;
+        }
+    }
+    behind(sums, r + row, column, 0, height, width);
+}
+
+// The same of 32 rows at most.
 template <class T, class Following>
 static inline void block_by_weights(const Left& left, const uint16_t* weights, Index steps, Index outputs, Index r, Index height,
                                     const Following& behind) {
-    alignas(64) float sums[PANEL * PANEL];
-    const Index panels = (outputs + PANEL - 1) / PANEL, products = steps * PRODUCTS<PARTS<T>>;
-    const Index least_share = (height + products - 1) / products, share = PARTS<T> == 1 && least_share < 3 ? 3 : least_share;
-    for (Index p = 0; p < panels; p++) {
-        zero_sums();
-        add_steps<PARTS<T>, LEFT_STAYS>(height > TILE, outputs - p * PANEL > TILE, left, weights + p * steps * 2 * PARTS<T> * NUMBERS,
-                                        steps, false, [&](Index i) {
-            if (p > 0 && i * share < height) behind(sums, r, (p - 1) * PANEL, i * share, least((i + 1) * share, height), PANEL);
-        });
-        store_sums(sums);
-    }
-    behind(sums, r, (panels - 1) * PANEL, 0, height, outputs - (panels - 1) * PANEL);
+    blocks_by_weights<T, LEFT_STAYS>([&](Index) { return left; }, height, weights, steps, outputs, r, behind, [] {});
 }
+
+// The rows of one of several threads, inside a parallel region: as even as tiles allow.
+struct Share {
+    Index begin, end;
+
+    explicit Share(Index rows) {
+        const Index tiles = (rows + TILE - 1) / TILE, me = omp_get_thread_num(), all_of_us = omp_get_num_threads();
+        begin = tiles * me / all_of_us * TILE, end = least(tiles * (me + 1) / all_of_us * TILE, rows);
+    }
+};
+static inline Index useful_threads(Index rows, Index threads) { return least(threads, panels_of(rows)); }
 
 #endif

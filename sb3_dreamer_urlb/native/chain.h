@@ -69,14 +69,12 @@ struct Between {
 // something of its own for work to use.
 template <class Make, class Work>
 static void by_blocks(Index rows, Index most, int threads, Make make, Work work) {
-    const Index tiles = (rows + TILE - 1) / TILE;
-#pragma omp parallel num_threads(least(threads, (tiles + 1) / 2))
+#pragma omp parallel num_threads(useful_threads(rows, threads))
     {
         auto mine = make();
         Tiles shaped;
-        const Index me = omp_get_thread_num(), all_of_us = omp_get_num_threads();
-        const Index end = least(tiles * (me + 1) / all_of_us * TILE, rows);
-        for (Index r = tiles * me / all_of_us * TILE; r < end; r += most) work(mine, r, least(end - r, most));
+        const Share its(rows);
+        for (Index r = its.begin; r < its.end; r += most) work(mine, r, least(its.end - r, most));
     }
 }
 

@@ -25,8 +25,8 @@ template <class T>
 static void windows_by_weights(const Windows<T>& windows, Index rows, const uint16_t* weights, Index outputs, Behind<T> behind,
                                const Pixels<T>* pixels, int threads) {
     const Index steps = steps_of(windows.depth()), stride = (steps | 1) * DEPTH;  // an odd number of lines: spread over the cache
-    const Index panel = steps * 2 * PARTS<T> * NUMBERS, laid = PANEL * stride * PARTS<T>, panels = (outputs + PANEL - 1) / PANEL;
-    const Index at_once = most(least(BLOCK / laid, 8), 1), size = at_once * PANEL, blocks = (rows + size - 1) / size;
+    const Index laid = PANEL * stride * PARTS<T>, at_once = most(least(BLOCK / laid, 8), 1);
+    const Index size = at_once * PANEL, blocks = (rows + size - 1) / size;
 #pragma omp parallel num_threads(least(threads, blocks))
     {
         static thread_local Scratch scratch;
@@ -36,7 +36,6 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
         uint16_t* operand = (uint16_t*)memory;
         T* lines = (T*)(memory + laid_bytes);
         T* results = (T*)(memory + laid_bytes + row_bytes);
-        alignas(64) float sums[2][PANEL * PANEL] = {};
         Behind<T> its = behind;
         if (pixels) its.out = results;
         Tiles tiles;
@@ -46,22 +45,8 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
             const auto height = [&](Index b) { return least(count - b * PANEL, PANEL); };
             for (Index b = 0; b < all; b++)
                 lay_out_windows(windows, r + b * PANEL, height(b), stride, lines, operand + b * laid);
-            const auto write = [&](Index turn, Index begin, Index end) {
-                const Index p = turn / all, b = turn % all;
-                its(sums[turn % 2], here + b * PANEL, p * PANEL, begin, least(end, height(b)), least(outputs - p * PANEL, PANEL));
-            };
-            const Index products = steps * PRODUCTS<PARTS<T>>, share = (PANEL + products - 1) / products;
-            for (Index turn = 0; turn < panels * all; turn++) {
-                const Index p = turn / all, b = turn % all;
-                const Left left = laid_out(operand + b * laid, stride, (T*)nullptr);
-                const auto meanwhile = [&](Index i) {
-                    if (turn > 0 && i * share < PANEL) write(turn - 1, i * share, (i + 1) * share);
-                };
-                zero_sums();
-                add_steps<PARTS<T>, RIGHT_STAYS>(height(b) > TILE, outputs - p * PANEL > TILE, left, weights + p * panel, steps, turn % 2, meanwhile);
-                store_sums(sums[turn % 2]);
-            }
-            write(panels * all - 1, 0, PANEL);
+            const auto left = [&](Index b) { return laid_out(operand + b * laid, stride, (T*)nullptr); };
+            blocks_by_weights<T, RIGHT_STAYS>(left, count, weights, steps, outputs, here, its, [] {});
             if (pixels) pixels->write_from(r, count, results);
         }
     }

@@ -31,32 +31,70 @@ static void lay_out_weights(const T* weight, Index stride, Index outputs, Index 
     }
 }
 
-// Rows of whole steps that begin with a line of the cache can be read as they are. What stood behind others, up to a step, would
-// meet weights of 0, which makes nothing of a number, but NaN of what is none.
-static inline bool fits(const BF16* x, Index stride, Index rows, Index depth) {
-    return rows >= PANEL && depth % DEPTH == 0 && stride % DEPTH == 0 && (uintptr_t)x % 64 == 0;
+// Some rows of the left operand. Rows of whole steps that begin with a line of the cache are read as they are, others are laid out.
+// What stood behind rows, up to a step, would meet weights of 0, which makes nothing of a number, but NaN of what is none.
+template <class T>
+struct LeftBlocks {
+    static constexpr Index MOST = 4;
+
+    LeftRows<T> panels[MOST];
+    bool as_is[MOST];
+    Index count = 0, now = 0;
+
+    LeftBlocks(const T* x, Index stride, Index rows, Index depth, uint16_t* room) {
+        const bool lines = depth % DEPTH == 0 && stride % DEPTH == 0 && (uintptr_t)x % 64 == 0;
+        for (Index r = 0; r < rows; r += PANEL, count++, room += laid_size<T>(PANEL, depth)) {
+            panels[count] = {x + r * stride, stride, least(rows - r, PANEL), depth, room};
+            as_is[count] = PARTS<T> == 1 && lines && rows - r >= PANEL;
+        }
+    }
+    Index bits() const {
+        Index all = 0;
+        for (Index i = 0; i < count; i++) all += as_is[i] ? 0 : panels[i].bits();
+        return all;
+    }
+    void lay_out_a_bit() {
+        while (as_is[now] || panels[now].row_of == PANEL) now++;
+        panels[now].lay_out_a_bit();
+    }
+    Left operator[](Index i) const {
+        return as_is[i] ? Left((const BF16*)panels[i].x, panels[i].stride) : Left(panels[i].out, PARTS<T>);
+    }
+};
+
+// Rows that meet a panel of weights one after the other: more than 32 where the weights are more than a core's cache holds.
+template <class T>
+static inline Index rows_at_once(Index depth, Index outputs) {
+    const Index CACHE = 1 << 20, bytes = laid_size<T>(PANEL, depth) * sizeof(uint16_t);
+    return PANEL * (bytes * panels_of(outputs) < CACHE ? 1 : bytes <= CACHE / 8 ? 4 : bytes <= CACHE / 4 ? 2 : 1);
 }
-static inline bool fits(const float*, Index, Index, Index) { return false; }
 
-static inline Left as_it_is(const BF16* x, Index stride) { return Left(x, stride); }
-static inline Left as_it_is(const float* x, Index) { return Left((const uint16_t*)x, 3); }  // never
-
+// While some rows are multiplied, the next ones are laid out.
 template <class T, class Out>
 static void rows_by_weights(const T* x, Index stride, Index rows, Index depth, const uint16_t* weights, Index outputs,
                             const Behind<Out>& behind, int threads) {
-    const Index steps = steps_of(depth), blocks = (rows + PANEL - 1) / PANEL;
-#pragma omp parallel num_threads(least(threads, blocks))
+    const Index steps = steps_of(depth), most = rows_at_once<T>(depth, outputs), room = most / PANEL * laid_size<T>(PANEL, depth);
+#pragma omp parallel num_threads(useful_threads(rows, threads))
     {
         static thread_local Scratch scratch;
-        uint16_t* laid = (uint16_t*)scratch.get(laid_size<T>(PANEL, depth) * sizeof(uint16_t));
+        uint16_t* laid = (uint16_t*)scratch.get(2 * room * sizeof(uint16_t));
+        const Share its(rows);
+        const auto blocks = [&](Index r) {
+            return LeftBlocks<T>(x + r * stride, stride, least(its.end - r, most), depth, laid + (r - its.begin) / most % 2 * room);
+        };
         Tiles tiles;
-#pragma omp for schedule(static)
-        for (Index block = 0; block < blocks; block++) {
-            const Index r = block * PANEL, height = least(rows - r, PANEL);
-            const bool as_is = fits(x, stride, height, depth);
-            if (!as_is) lay_out_left(x + r * stride, stride, height, depth, laid);
-            const Left left = as_is ? as_it_is(x + r * stride, stride) : Left(laid, PARTS<T>);
-            block_by_weights<T>(left, weights, steps, outputs, r, height, behind);
+        LeftBlocks<T> now = blocks(its.begin);
+        for (Index i = now.bits(); i > 0; i--) now.lay_out_a_bit();
+        for (Index r = its.begin; r < its.end; r += most) {
+            const Index height = least(its.end - r, most);
+            LeftBlocks<T> next = blocks(r + most);
+            Pace pace = {next.bits(), calls_of<T>(height, steps, outputs)};
+            const auto meanwhile = [&] { pace([&] { next.lay_out_a_bit(); }); };
+            if (most == PANEL)
+                blocks_by_weights<T, LEFT_STAYS>([&](Index i) { return now[i]; }, height, weights, steps, outputs, r, behind, meanwhile);
+            else
+                blocks_by_weights<T, RIGHT_STAYS>([&](Index i) { return now[i]; }, height, weights, steps, outputs, r, behind, meanwhile);
+            now = next;
         }
     }
 }

@@ -213,19 +213,46 @@ static void lay_out_by_depth(const T* x, Index stride, Index across, Index depth
     }
 }
 
-// x (across, depth), rows `stride` apart, as the left operand: row after row, as they are in memory.
+// x (across, depth), at most 32 rows, `stride` apart, as the left operand: row after row, as they are in memory; some steps of a row
+// at a time, for who has something else to do meanwhile.
 template <class T>
-static void lay_out_left(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
-    const Index steps = steps_of(depth);
-    __m512i parts[PARTS<T>];
-    for (Index a = 0; a < up_to(across, PANEL); a++) {
-        uint16_t* to = tile_of<T>(out, a, 0, steps) + a % TILE * DEPTH;
-        for (Index s = 0; s < steps; s++) {
-            row(x + a * stride + s * DEPTH, a < across ? first(depth - s * DEPTH) : 0, parts);
+struct LeftRows {
+    static constexpr Index AT_ONCE = PARTS<T> == 1 ? 4 : 1;
+
+    const T* x;
+    Index stride, across, depth;
+    uint16_t* out;
+    Index row_of = 0, step = 0;
+
+    Index bits() const { return PANEL * ((steps_of(depth) + AT_ONCE - 1) / AT_ONCE); }
+    void lay_out_a_bit() {
+        const Index steps = steps_of(depth);
+        uint16_t* to = tile_of<T>(out, row_of, step, steps) + row_of % TILE * DEPTH;
+        __m512i parts[PARTS<T>];
+        for (Index end = least(step + AT_ONCE, steps); step < end; step++) {
+            row(x + row_of * stride + step * DEPTH, row_of < across ? first(depth - step * DEPTH) : 0, parts);
             for (int i = 0; i < PARTS<T>; i++, to += 2 * NUMBERS) _mm512_store_si512(to, parts[i]);
         }
+        if (step == steps) step = 0, row_of++;
     }
+    void lay_out() {
+        while (row_of < PANEL) lay_out_a_bit();
+    }
+};
+template <class T>
+static inline void lay_out_left(const T* x, Index stride, Index across, Index depth, uint16_t* out) {
+    LeftRows<T>{x, stride, across, depth, out}.lay_out();
 }
+
+// Some bits of work, as even as can be, in so many calls.
+struct Pace {
+    Index bits, calls, credit = 0;
+
+    template <class Work>
+    void operator()(Work work) {
+        for (credit += bits; credit >= calls; credit -= calls) work();
+    }
+};
 
 // x (across, depth), rows `stride` apart, as the right operand.
 template <class T>

@@ -109,16 +109,13 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
         for (Index r = 0; r < rows; r += size, turn = 1 - turn) {
             Pieces<T, Right>&now = pieces[turn], &next = pieces[1 - turn];
             const Index steps = steps_of(now.count), panel = steps * 2 * PARTS<T> * NUMBERS;
-            Index left_over = 0;
+            const Index panels = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL);
+            Pace pace = {0, panels * steps * PRODUCTS<PARTS<T>>};
             if (r + size < rows)
-                next.start(begin + r + size, least(rows - r - size, size), c, now.columns), left_over = next.bits();
+                next.start(begin + r + size, least(rows - r - size, size), c, now.columns), pace.bits = next.bits();
             else if (c + COLUMNS < n)
-                next.start(begin, least(rows, size), c + COLUMNS, least(n - c - COLUMNS, COLUMNS)), left_over = next.bits();
-            const Index share = left_over, all = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL) * steps * PRODUCTS<PARTS<T>>;
-            Index credit = 0;
-            const auto meanwhile = [&](Index) {
-                for (credit += share; credit >= all && left_over > 0; credit -= all, left_over--) next.lay_out_a_bit();
-            };
+                next.start(begin, least(rows, size), c + COLUMNS, least(n - c - COLUMNS, COLUMNS)), pace.bits = next.bits();
+            const auto meanwhile = [&](Index) { pace([&] { next.lay_out_a_bit(); }); };
             float* sum = sums + up_to(m, PANEL) * c;
             for (Index i = 0; i < m; i += PANEL) {
                 for (Index j = 0; j < now.columns; j += PANEL, sum += PANEL * PANEL) {
@@ -132,7 +129,6 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
                     store_sums(sum);
                 }
             }
-            for (; left_over > 0; left_over--) next.lay_out_a_bit();
         }
     }
 }
