@@ -6,6 +6,31 @@
 
 #ifdef HAS_TILES
 
+// 32 numbers, if some only those of the mask.
+struct Two {
+    Floats low, high;
+};
+template <bool some>
+static inline Two load_two(const float* p, __mmask32 mask) {
+    if (!some) return {load(p), load(p + LANES)};
+    return {(Floats)_mm512_maskz_loadu_ps(mask, p), (Floats)_mm512_maskz_loadu_ps(mask >> 16, p + LANES)};
+}
+template <bool some>
+static inline Two load_two(const BF16* p, __mmask32 mask) {
+    __m512i x = some ? _mm512_maskz_loadu_epi16(mask, p) : _mm512_loadu_si512(p);
+    return {(Floats)_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_castsi512_si256(x)), 16),
+            (Floats)_mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(x, 1)), 16)};
+}
+template <bool some>
+static inline void store_two(float* p, Two x, __mmask32 mask) {
+    _mm512_mask_storeu_ps(p, some ? mask : 0xffff, (__m512)x.low);
+    _mm512_mask_storeu_ps(p + LANES, some ? mask >> 16 : 0xffff, (__m512)x.high);
+}
+template <bool some>
+static inline void store_two(BF16* p, Two x, __mmask32 mask) {
+    _mm512_mask_storeu_epi16(p, some ? mask : ~0u, (__m512i)_mm512_cvtne2ps_pbh((__m512)x.high, (__m512)x.low));
+}
+
 // What becomes of a product: + bias (outputs,) + plus (rows, outputs), then ELU. Null: not.
 template <class Out, class Plus = Out>
 struct Behind {
