@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import pytest
 import torch as th
 
+from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.dense import linear
 from sb3_dreamer_urlb.envs import load_renderer
 from sb3_dreamer_urlb.presets import PRESETS
 
@@ -118,6 +120,16 @@ def test_points_of_a_curve_do_not_change_those_of_another(load):
     assert own.planner.policy.planner.config.n_samples == 2 * samples
     own.work("environments, planner", 2)()
     assert own.planner.policy.planner.config.n_samples == samples
+
+
+def test_arithmetic_is_counted_whoever_computes_it(load, kernels_of_every_size):
+    layer = th.nn.Linear(40, 50)
+
+    def work():
+        with native.using("native", "cpu"):
+            return linear(th.ones(30, 40), layer.weight, layer.bias)
+
+    assert load("common").tflop(work) == 2 * 30 * 40 * 50 / 1e12
 
 
 def test_methods(run, load, monkeypatch):
