@@ -130,8 +130,10 @@ def interleaved(
 
 
 def tflop(work: Callable[[], object]) -> float:
-    """TFLOP of matrix products and convolutions that some work asks for, as torch counts them: done with torch's kernels, because
-    it knows nothing of ours."""
+    """TFLOP of matrix products and convolutions that some work asks for, as torch counts them.
+
+    The work is done with torch's kernels, because it knows nothing of ours.
+    """
     with mock.patch.object(native, "active", lambda: False), FlopCounterMode(display=False) as counter:
         work()
     return float(counter.get_total_flops()) / 1e12
