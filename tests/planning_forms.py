@@ -19,6 +19,18 @@ N, M = 2, 6
 METHODS = [(None, False), (None, True), ("diayn", False), ("aps", False)]
 
 
+class StepByStep:
+    """What a model has that knows single steps only."""
+
+    def imagine(self, state: LatentState, action: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """See ``PlannableModel.imagine``."""
+        features = []
+        for its in action.unbind(1):
+            state = self.step(state, its, generator)  # type: ignore[attr-defined]
+            features.append(state.feature)
+        return th.stack(features)
+
+
 def agent_and_skill(
     world_model: Callable[..., WorldModel], method: str | None, discount_head: bool
 ) -> tuple[Agent, th.Tensor]:

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from planning_forms import StepByStep
 
 from sb3_dreamer_urlb.planning import PLANNERS, DynaMPC, PlannerConfig, make_planner
 from sb3_dreamer_urlb.types import LatentState
@@ -16,7 +17,7 @@ A, H = 2, 5
 TARGETS = th.tensor([[0.5, -0.3], [-0.7, 0.1], [0.0, 0.9], [-0.2, -0.8]])
 
 
-class Toy:
+class Toy(StepByStep):
     """A state remembers its target and the last action; its reward is minus their squared distance.
 
     :param proposal: action of the actor in every state, None for the target itself
@@ -30,13 +31,6 @@ class Toy:
     def step(self, state, action, generator):
         self.actions.append(action)
         return LatentState(state.stoch, action)
-
-    def imagine(self, state, action, generator):
-        features = []
-        for its in action.unbind(1):
-            state = self.step(state, its, generator)
-            features.append(state.feature)
-        return th.stack(features)
 
     def rewards(self, feature):
         return -(feature[..., A:] - feature[..., :A]).square().sum(-1)

@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from planning_forms import StepByStep
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
@@ -227,7 +228,7 @@ def test_how_often_choices_are_drawn():
     assert th.allclose(drawn.mean(0), probs, atol=0.015)
 
 
-class _Guess:
+class _Guess(StepByStep):
     """A model that rewards one sequence of choices; the state counts the steps."""
 
     answer = (1, 0, 2)
@@ -236,13 +237,6 @@ class _Guess:
         reward = th.stack([action[:, self.answer[i]] for i in range(3)], -1)
         t = state.deter[:, :1].long()
         return LatentState(reward.gather(1, t.clamp(max=2)), state.deter + 1)
-
-    def imagine(self, state, action, generator):
-        features = []
-        for its in action.unbind(1):
-            state = self.step(state, its, generator)
-            features.append(state.feature)
-        return th.stack(features)
 
     def rewards(self, feature):
         return feature[..., 0]
