@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import re
@@ -134,9 +135,16 @@ def tflop(work: Callable[[], object]) -> float:
 
     The work is done with torch's kernels, because it knows nothing of ours.
     """
-    with mock.patch.object(native, "active", lambda: False), FlopCounterMode(display=False) as counter:
+    prepacked = getattr(th.ops.mkldnn, "_linear_pointwise", None)
+    counter = FlopCounterMode(display=False, custom_mapping={prepacked: _prepacked} if prepacked else {})
+    with mock.patch.object(native, "active", lambda: False), counter:
         work()
     return float(counter.get_total_flops()) / 1e12
+
+
+def _prepacked(x: Sequence[int], *_: Any, out_shape: Sequence[int], **__: Any) -> int:
+    """Of the product that PrepackedLinear asks for, which torch does not count."""
+    return 2 * math.prod(x) * out_shape[-1]
 
 
 class Product:

@@ -15,6 +15,7 @@ import torch as th
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.dense import linear
 from sb3_dreamer_urlb.envs import load_renderer
+from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.presets import PRESETS
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -129,7 +130,9 @@ def test_arithmetic_is_counted_whoever_computes_it(load, kernels_of_every_size):
         with native.using("native", "cpu"):
             return linear(th.ones(30, 40), layer.weight, layer.bias)
 
-    assert load("common").tflop(work) == 2 * 30 * 40 * 50 / 1e12
+    prepacked = PrepackedLinear(layer.weight, layer.bias, th.float32)
+    for its in (work, lambda: prepacked(th.ones(30, 40)), lambda: prepacked(th.ones(30, 40), th.ones(30, 50))):
+        assert load("common").tflop(its) == 2 * 30 * 40 * 50 / 1e12
 
 
 def test_methods(run, load, monkeypatch):
