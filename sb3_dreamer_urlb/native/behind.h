@@ -68,9 +68,6 @@ struct Behind {
     }
 };
 
-// Panels of so many rows or columns.
-static inline Index panels_of(Index size) { return (size + PANEL - 1) / PANEL; }
-
 // How often the multiplication of so many rows with weights says `meanwhile`.
 template <class T>
 static inline Index calls_of(Index rows, Index steps, Index outputs) {

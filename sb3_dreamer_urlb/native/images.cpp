@@ -41,7 +41,7 @@ static void windows_by_weights(const Windows<T>& windows, Index rows, const uint
         Tiles tiles;
 #pragma omp for schedule(static)
         for (Index block = 0; block < blocks; block++) {
-            const Index r = block * size, count = least(rows - r, size), here = pixels ? 0 : r, all = (count + PANEL - 1) / PANEL;
+            const Index r = block * size, count = least(rows - r, size), here = pixels ? 0 : r, all = panels_of(count);
             const auto height = [&](Index b) { return least(count - b * PANEL, PANEL); };
             for (Index b = 0; b < all; b++)
                 lay_out_windows(windows, r + b * PANEL, height(b), stride, lines, operand + b * laid);
@@ -98,8 +98,8 @@ template <class T>
 static void places_by_weights(const Windows<T>& windows, Index images, const uint16_t* weights, Index outputs, Behind<T> behind,
                               const Pixels<T>& pixels, int threads) {
     const Index steps = steps_of(windows.depth()), stride = (steps | 1) * DEPTH, panel = steps * 2 * PARTS<T> * NUMBERS;
-    const Index laid = PANEL * stride * PARTS<T>, panels = (outputs + PANEL - 1) / PANEL, at_once = most(least(BLOCK / laid, 8), 1);
-    const Index places = (images + PANEL - 1) / PANEL * windows.grid_height * windows.grid_width, blocks = (places + at_once - 1) / at_once;
+    const Index laid = PANEL * stride * PARTS<T>, panels = panels_of(outputs), at_once = most(least(BLOCK / laid, 8), 1);
+    const Index places = panels_of(images) * windows.grid_height * windows.grid_width, blocks = (places + at_once - 1) / at_once;
 #pragma omp parallel num_threads(least(threads, blocks))
     {
         static thread_local Scratch scratch;
@@ -160,8 +160,8 @@ static void lines_by_weights(const Windows<BF16>& windows, Index images, const u
                              const Pixels<BF16>* pixels, int threads) {
     const Index channels = windows.channels, piece = steps_of(windows.kernel_width * channels), steps = windows.kernel_height * piece;
     const Index apart = windows.stride * channels, line = (steps_of((PANEL - 1) * apart) + piece) * DEPTH;
-    const Index laid = windows.kernel_height * line, panel = steps * 2 * NUMBERS, panels = (outputs + PANEL - 1) / PANEL;
-    const Index width = windows.grid_width, across = (width + PANEL - 1) / PANEL, all_panels = images * windows.grid_height * across;
+    const Index laid = windows.kernel_height * line, panel = steps * 2 * NUMBERS, panels = panels_of(outputs);
+    const Index width = windows.grid_width, across = panels_of(width), all_panels = images * windows.grid_height * across;
     const Index at_once = most(least(BLOCK / laid, 8), 1), blocks = (all_panels + at_once - 1) / at_once;
 #pragma omp parallel num_threads(least(threads, blocks))
     {

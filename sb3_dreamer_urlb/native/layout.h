@@ -14,6 +14,7 @@ constexpr Index TILE = 16, PANEL = 2 * TILE, DEPTH = 32, NUMBERS = TILE * DEPTH;
 
 static inline Index up_to(Index x, Index multiple) { return (x + multiple - 1) / multiple * multiple; }
 static inline Index steps_of(Index depth) { return (depth + DEPTH - 1) / DEPTH; }
+static inline Index panels_of(Index across) { return (across + PANEL - 1) / PANEL; }
 static inline Index least(Index a, Index b) { return a < b ? a : b; }
 
 template <class T>

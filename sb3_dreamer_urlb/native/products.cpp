@@ -20,7 +20,7 @@ EXPORT int has_tiles() {
 // Weights (outputs, depth), or (depth, outputs) if by_depth, as the right operand.
 template <class T>
 static void lay_out_weights(const T* weight, Index stride, Index outputs, Index depth, bool by_depth, uint16_t* out, int threads) {
-    const Index panels = (outputs + PANEL - 1) / PANEL, panel = laid_size<T>(PANEL, depth);
+    const Index panels = panels_of(outputs), panel = laid_size<T>(PANEL, depth);
 #pragma omp parallel for num_threads(threads) if (outputs * depth > WORTH_A_THREAD)
     for (Index p = 0; p < panels; p++) {
         const Index some = least(outputs - p * PANEL, PANEL);

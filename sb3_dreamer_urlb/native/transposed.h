@@ -49,7 +49,7 @@ struct Pieces {
         for (Index a = 0; a < columns; a += PANEL) places[a / PANEL] = right->columns(c + a, least(columns - a, PANEL));
     }
     Index bits() const {
-        return steps_of(count) * (up_to(m, PANEL) / PANEL * LEFT_BITS + up_to(columns, PANEL) / PANEL * RIGHT_BITS);
+        return steps_of(count) * (panels_of(m) * LEFT_BITS + panels_of(columns) * RIGHT_BITS);
     }
     void lay_out_a_bit() {
         const Index steps = steps_of(count), r = step * DEPTH;
@@ -109,7 +109,7 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
         for (Index r = 0; r < rows; r += size, turn = 1 - turn) {
             Pieces<T, Right>&now = pieces[turn], &next = pieces[1 - turn];
             const Index steps = steps_of(now.count), panel = steps * 2 * PARTS<T> * NUMBERS;
-            const Index panels = up_to(m, PANEL) / PANEL * (up_to(now.columns, PANEL) / PANEL);
+            const Index panels = panels_of(m) * panels_of(now.columns);
             Pace pace = {0, panels * steps * PRODUCTS<PARTS<T>>};
             if (r + size < rows)
                 next.start(begin + r + size, least(rows - r - size, size), c, now.columns), pace.bits = next.bits();
@@ -137,7 +137,7 @@ static void add_transposed_product(const T* left, Index left_stride, const Right
 static inline void gather_row(const float* sums, Index i, Index m, Index n, Index threads, float* row) {
     const Index size = up_to(m, PANEL) * up_to(n, PANEL);
     for (Index j = 0; j < n; j += TILE) {
-        const Index c = j / COLUMNS * COLUMNS, across = up_to(least(n - c, COLUMNS), PANEL) / PANEL;
+        const Index c = j / COLUMNS * COLUMNS, across = panels_of(least(n - c, COLUMNS));
         const Index block = up_to(m, PANEL) * c + (i / PANEL * across + (j - c) / PANEL) * PANEL * PANEL;
         const float* at = sums + block + i % PANEL * PANEL + j % PANEL;
         Floats total = load(at);
