@@ -19,7 +19,7 @@ import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report, tflop
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.learning.learner import Learner
 
 #: curve → its points
 POINTS: dict[str, list[int]] = {

@@ -26,8 +26,8 @@ import torch as th
 from common import NoiseImages, machine
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.graphs import WARM_UPS
-from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.learning.graphs import WARM_UPS
+from sb3_dreamer_urlb.learning.learner import Learner
 from sb3_dreamer_urlb.types import SequenceBatch
 
 MODES = {"eager": "eager", "graphs": "cuda_graphs"}

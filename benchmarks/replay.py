@@ -20,7 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import SequenceReplayBuffer
-from sb3_dreamer_urlb.memory import keep_freed_memory
+from sb3_dreamer_urlb.learning.memory import keep_freed_memory
 from sb3_dreamer_urlb.replay.stores import STORES
 
 #: that keep their rows in a folder

@@ -12,7 +12,7 @@ from itertools import product
 import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report
 
-from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.learning.learner import Learner
 from sb3_dreamer_urlb.types import SequenceBatch
 
 TFLOP = 2.4

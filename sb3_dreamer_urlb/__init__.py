@@ -11,31 +11,32 @@ from typing import TYPE_CHECKING, Any
 from sb3_dreamer_urlb.envs import register_envs
 
 if TYPE_CHECKING:
+    from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
+    from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback, PhaseSwitchCallback
+    from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
+    from sb3_dreamer_urlb.callbacks.videos import VideoCallback
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+    from sb3_dreamer_urlb.dreamer_v2.policies import CnnPolicy, DreamerPolicy
     from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
-    from sb3_dreamer_urlb.numerical_faults import NumericalFaultError
-    from sb3_dreamer_urlb.phases import FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
+    from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError
     from sb3_dreamer_urlb.planning import PlannerConfig
-    from sb3_dreamer_urlb.policies import CnnPolicy, DreamerPolicy
     from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-    from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
     from sb3_dreamer_urlb.snapshots import SnapshotError
-    from sb3_dreamer_urlb.videos import VideoCallback
 
 _MODULES = {
-    "CnnPolicy": "policies",
-    "DreamerPolicy": "policies",
+    "CnnPolicy": "dreamer_v2.policies",
+    "DreamerPolicy": "dreamer_v2.policies",
     "DreamerV2": "dreamer_v2",
-    "FineTuneCallback": "phases",
+    "FineTuneCallback": "callbacks.phase_switch",
     "IntrinsicReward": "intrinsic",
-    "NumericalFaultError": "numerical_faults",
-    "PhaseSwitchCallback": "phases",
+    "NumericalFaultError": "learning.numerical_faults",
+    "PhaseSwitchCallback": "callbacks.phase_switch",
     "PlannerConfig": "planning",
-    "RunCheckpointCallback": "run_checkpoints",
+    "RunCheckpointCallback": "callbacks.checkpoint",
     "SequenceReplayBuffer": "replay",
-    "SnapshotCallback": "phases",
+    "SnapshotCallback": "callbacks.snapshot",
     "SnapshotError": "snapshots",
-    "VideoCallback": "videos",
+    "VideoCallback": "callbacks.videos",
     "register_intrinsic_reward": "intrinsic",
 }
 

@@ -50,14 +50,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: dict[str, Any]) -> int:
-    from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+    from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
 
     run_demo(DemoConfig(**options))
     return 0
 
 
 def _methods(options: dict[str, Any]) -> int:
-    from sb3_dreamer_urlb.methods_tour import TourConfig, run_tour
+    from sb3_dreamer_urlb.cli.methods_tour import TourConfig, run_tour
 
     visits = run_tour(TourConfig(**{**options, "methods": tuple(options.get("methods", ()))}))
     return int(any(visit.faults() for visit in visits))

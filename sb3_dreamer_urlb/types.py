@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 if TYPE_CHECKING:
-    from sb3_dreamer_urlb.world_model.observations import Observations
+    from sb3_dreamer_urlb.spaces.observations import Observations
 
 Metrics = dict[str, th.Tensor]
 #: of one kind, or several by name (Dict spaces)

@@ -13,14 +13,15 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from hypothesis import settings
 
-from sb3_dreamer_urlb import DreamerV2, activation, distributions, native
+from sb3_dreamer_urlb import DreamerV2, native
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.native import build, planner_ops, product_ops
+from sb3_dreamer_urlb.nn import activation, distributions
+from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.types import Posterior, SequenceBatch
 from sb3_dreamer_urlb.world_model import convolution, gru
-from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 IMAGE, ACTIONS = (3, 16, 16), 2

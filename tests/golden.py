@@ -20,16 +20,17 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_dreamer_urlb import distributions, native
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
-from sb3_dreamer_urlb.learner import Learner, LearnerConfig
-from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig, native_parts
-from sb3_dreamer_urlb.planning.prepared import planned
+from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
+from sb3_dreamer_urlb.planning.prepared.agent import native_parts, planned
+from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
-from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 RELATIVE, ABSOLUTE = 1e-4, 2e-5

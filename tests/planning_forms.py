@@ -9,7 +9,7 @@ from golden import deterministic_draws
 
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.planning.prepared import PreparedAgent
+from sb3_dreamer_urlb.planning.prepared.agent import PreparedAgent
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 
-from sb3_dreamer_urlb import activation
+from sb3_dreamer_urlb.nn import activation
 
 SPECIAL = [0.0, -0.0, float("inf"), -float("inf"), float("nan"), 1e-30, -1e-30, -100.0, 100.0]
 #: a rounding of 1 in float32, and one of the result

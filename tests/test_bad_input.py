@@ -23,13 +23,13 @@ from sb3_dreamer_urlb import (
     SnapshotCallback,
     SnapshotError,
     dreamer_v2,
-    policies,
     register_intrinsic_reward,
 )
-from sb3_dreamer_urlb.arguments import INTEGERS, NUMBERS, SHORT_EPISODES
-from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb.dreamer_v2 import policies
+from sb3_dreamer_urlb.dreamer_v2.arguments import INTEGERS, NUMBERS, SHORT_EPISODES
 from sb3_dreamer_urlb.evaluation.scores import normalized_score
 from sb3_dreamer_urlb.intrinsic import LBS
+from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import Actor, Critic, RewardNormalizer, SuccessorCritic
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic import RewardSource
-from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 
 SYNCHRONISING = ["item", "cpu", "numpy", "tolist", "__bool__", "__float__", "__int__", "__index__", "__array__"]
 

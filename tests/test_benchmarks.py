@@ -13,10 +13,10 @@ import pytest
 import torch as th
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.dense import linear
+from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import load_renderer
-from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
-from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.nn.dense import linear
+from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 WHERE = {

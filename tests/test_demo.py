@@ -13,8 +13,9 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from PIL import Image
 
-from sb3_dreamer_urlb import DreamerV2, __main__, demo
-from sb3_dreamer_urlb.demo import DemoConfig, run_demo
+from sb3_dreamer_urlb import DreamerV2, __main__
+from sb3_dreamer_urlb.cli import demo
+from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
 from sb3_dreamer_urlb.evaluation import figures
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 
-from sb3_dreamer_urlb import dense
+from sb3_dreamer_urlb.nn import dense
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,8 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.distributions import BoundedNormal
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.distributions import BoundedNormal
 
 weight_lists = st.lists(st.sampled_from([0.0, 0.01, 0.3, 1.0, 5.0]), min_size=2, max_size=8).filter(any)
 

@@ -17,9 +17,9 @@ from gymnasium import spaces
 
 import sb3_dreamer_urlb
 from sb3_dreamer_urlb import dreamer_v2, envs, hub, planning
+from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.intrinsic import registry
-from sb3_dreamer_urlb.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
 OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]

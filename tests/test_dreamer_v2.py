@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 
 SPACES = {
     "lopsided": spaces.Box(np.array([-3.0, 1.0], np.float32), np.array([0.5, 1.5], np.float32)),

@@ -17,7 +17,7 @@ from test_run_folder import everything, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
 from sb3_dreamer_urlb.envs import make_supervised_vec_env
-from sb3_dreamer_urlb.run_folder import RunFolder
+from sb3_dreamer_urlb.runs.run_folder import RunFolder
 from sb3_dreamer_urlb.snapshots import atomic
 
 SAVED = ("weights", "moments", "counters", "episodes")

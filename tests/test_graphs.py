@@ -21,12 +21,15 @@ from gymnasium import spaces
 from tape import CannotRecord, TapeBackend, refusal
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_dreamer_urlb import DreamerV2, graphs, policies, precision
-from sb3_dreamer_urlb import learner as learner_module
+from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.agent import PlannedAgent
-from sb3_dreamer_urlb.graphs import WARM_UPS, Recorder
+from sb3_dreamer_urlb.dreamer_v2 import policies
 from sb3_dreamer_urlb.intrinsic import LBS
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
+from sb3_dreamer_urlb.learning import graphs
+from sb3_dreamer_urlb.learning import learner as learner_module
+from sb3_dreamer_urlb.learning.graphs import WARM_UPS, Recorder
+from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 
 #: their search for neighbours looks at the distances on the host

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_dreamer_urlb.presets import PRESETS
+from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 
 SCRIPT = Path(__file__).parent.parent / "benchmarks" / "vector_tasks.py"
 #: least mean return of 20 deterministic episodes; random actions give 22 and -1200

@@ -9,7 +9,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 
 from sb3_dreamer_urlb.__main__ import main
-from sb3_dreamer_urlb.methods_tour import TourConfig, Visit, run_tour
+from sb3_dreamer_urlb.cli.methods_tour import TourConfig, Visit, run_tour
 
 EIGHT = ("icm", "plan2explore", "rnd", "lbs", "apt", "diayn", "aps", "random")
 

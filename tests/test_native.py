@@ -16,8 +16,9 @@ from test_resume import crash
 from test_run_folder import everything, scramble, vec_env
 from test_speed import Calls
 
-from sb3_dreamer_urlb import RunCheckpointCallback, activation, native
+from sb3_dreamer_urlb import RunCheckpointCallback, native
 from sb3_dreamer_urlb.native import build, ops
+from sb3_dreamer_urlb.nn import activation
 
 SPECIAL = [0.0, -0.0, float("inf"), -float("inf"), float("nan"), 1e-30, -1e-30, -100.0, 100.0]
 #: of ELU relative to max(|x|, 1), and of a product

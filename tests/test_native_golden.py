@@ -8,8 +8,8 @@ import torch as th
 from test_golden import FILES, OTHERS, golden_path
 from test_speed import Calls
 
-from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.native import product_ops
+from sb3_dreamer_urlb.nn import distributions
 
 #: what runs: on every processor, with tiles, and what a plan adds to both
 LEARNING = {"scale_images", "bias_elu_", "elu_backward", "squared_distance"}

@@ -13,10 +13,11 @@ from test_native import ROUNDING
 from test_speed import Calls
 from torch import nn
 
-from sb3_dreamer_urlb import distributions, native
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import image_ops, pixel_ops, product_ops
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.world_model import convolution
-from sb3_dreamer_urlb.world_model.observations import Images
 
 #: channels and size of the wide image, channels of the narrow one, kernel, stride, images
 SHAPES = [

@@ -8,9 +8,10 @@ import torch.nn.functional as F
 from test_native import ROUNDING
 from test_speed import Calls
 
-from sb3_dreamer_urlb import dense, distributions, native
-from sb3_dreamer_urlb.distributions import sample_one_hot
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import planner_ops, product_ops
+from sb3_dreamer_urlb.nn import dense, distributions
+from sb3_dreamer_urlb.nn.distributions import sample_one_hot
 
 FORMATS = [th.float32, th.bfloat16]
 PRODUCTS = ("rows_by_weights", "transposed_product", "lay_out_weights")

@@ -13,13 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning_forms import METHODS, M, N, agent_and_skill, check_short_products, check_states_and_scores
 
-from sb3_dreamer_urlb import distributions, native
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.native import planner_ops
+from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
-from sb3_dreamer_urlb.planning.native_parts import NativeDynamics, NativeHead
-from sb3_dreamer_urlb.planning.prepared import PreparedAgent
-from sb3_dreamer_urlb.planning.prepared_parts import Head
+from sb3_dreamer_urlb.planning.prepared.agent import PreparedAgent
+from sb3_dreamer_urlb.planning.prepared.native_parts import NativeDynamics, NativeHead
+from sb3_dreamer_urlb.planning.prepared.parts import Head
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import product_ops, rollout_ops
-from sb3_dreamer_urlb.planning.native_parts import NativeDynamics
+from sb3_dreamer_urlb.planning.prepared.native_parts import NativeDynamics
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 

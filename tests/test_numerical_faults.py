@@ -15,8 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_dreamer_urlb import DreamerV2, NumericalFaultError, RunCheckpointCallback
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
-from sb3_dreamer_urlb.numerical_faults import MAX_IN_A_ROW
-from sb3_dreamer_urlb.optim import ClippedAdam
+from sb3_dreamer_urlb.learning.numerical_faults import MAX_IN_A_ROW
+from sb3_dreamer_urlb.learning.optim import ClippedAdam
 
 
 def with_skill(learner, batch):

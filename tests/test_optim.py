@@ -9,7 +9,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb.optim import ClippedAdam
+from sb3_dreamer_urlb.learning.optim import ClippedAdam
 
 STEPS = 6
 

@@ -12,8 +12,10 @@ import torch as th
 from conftest import infer
 from torch import nn
 
-from sb3_dreamer_urlb import DreamerV2, memory, nets, precision
+from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.behavior import actor_critic
+from sb3_dreamer_urlb.learning import memory
+from sb3_dreamer_urlb.nn import nets, precision
 from sb3_dreamer_urlb.world_model import convolution, decoder, encoder, rssm
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, PatchesAndPhases, Phases
 
@@ -222,7 +224,7 @@ def test_freed_memory_costs_no_page_faults(unset):
     """In a process of its own: the setting cannot be taken back."""
     code = """
 import resource, torch
-from sb3_dreamer_urlb import memory
+from sb3_dreamer_urlb.learning import memory
 kept = memory.keep_freed_memory()
 def faults():
     # tensors that live and die as in an update: some stay until its end

@@ -17,7 +17,7 @@ from test_run_folder import RepeatingEnv, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard
-from sb3_dreamer_urlb.run_folder import SNAPSHOT
+from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
 
 
 class StopAt(BaseCallback):

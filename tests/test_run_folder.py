@@ -21,7 +21,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
-from sb3_dreamer_urlb.run_folder import RunFolder
+from sb3_dreamer_urlb.runs.run_folder import RunFolder
 
 LENGTH = 20
 

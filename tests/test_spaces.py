@@ -13,12 +13,12 @@ from planning_forms import StepByStep
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.actions import make_actions
-from sb3_dreamer_urlb.distributions import OneHotChoices
+from sb3_dreamer_urlb.nn.distributions import OneHotChoices
 from sb3_dreamer_urlb.planning import CategoricalDynaMPC, PlannerConfig
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.spaces.actions import make_actions
+from sb3_dreamer_urlb.spaces.observations import Classes, DictObservations, Images, Numbers, vectors
 from sb3_dreamer_urlb.types import LatentState
-from sb3_dreamer_urlb.world_model.observations import Classes, DictObservations, Images, Numbers, vectors
 
 IMAGE = spaces.Box(0, 255, (16, 20, 3), np.uint8)
 VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float64)

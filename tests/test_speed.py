@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import product_ops
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
-from sb3_dreamer_urlb.planning.prepared import planned
+from sb3_dreamer_urlb.planning.prepared.agent import planned
 
 # Operator calls by what runs; T = 5 and H = 3 in an update, H = 3 and J = 2 in a plan.
 # A plan on a CPU takes more and cheaper ones: its draws add up one class after the other, for all states at once.

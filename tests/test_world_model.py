@@ -12,10 +12,10 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.types import LatentState, Posterior
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, deconvolution_kernels
 from sb3_dreamer_urlb.world_model.encoder import ConvEncoder
-from sb3_dreamer_urlb.world_model.observations import Images
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 

@@ -26,8 +26,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
+from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
-from sb3_dreamer_urlb.presets import PRESETS
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
 from sb3_dreamer_urlb.zoo import registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main

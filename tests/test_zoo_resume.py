@@ -23,7 +23,7 @@ from test_run_folder import RepeatingEnv, everything
 from test_zoo import CONFIGS, FLIP, ROOT, STAND, TINY, TRAIN, latest_run, model_in, train, zoo  # noqa: F401
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.run_folder import RunFolder, steps_done
+from sb3_dreamer_urlb.runs.run_folder import RunFolder, steps_done
 from sb3_dreamer_urlb.zoo import resuming
 from sb3_dreamer_urlb.zoo.__main__ import main
 

@@ -8,10 +8,10 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.distributions import BoundedNormal, OneHotChoices
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import full
 from sb3_dreamer_urlb.types import Imagination, Metrics
 
 MIN_STD = 0.1

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 
-from sb3_dreamer_urlb import run_folder
 from sb3_dreamer_urlb.evaluation import history
-from sb3_dreamer_urlb.run_folder import RunFolder
+from sb3_dreamer_urlb.runs import run_folder
+from sb3_dreamer_urlb.runs.run_folder import RunFolder
 from sb3_dreamer_urlb.snapshots.model_data import argument, describe_arguments
 from sb3_dreamer_urlb.snapshots.values import contains_custom, decode
 

@@ -10,12 +10,13 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
+from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation import figures
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.number_checks import check_positive
-from sb3_dreamer_urlb.phases import PhaseSwitchCallback, SnapshotCallback
 
 
 @dataclass

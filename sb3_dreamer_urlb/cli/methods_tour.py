@@ -18,11 +18,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import check_positive
-from sb3_dreamer_urlb.presets import get_preset
 
 COLUMNS = ("method", "updates", "intrinsic reward", "spread", "module's loss", "fine-tuned", "minutes", "")
 

@@ -13,9 +13,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
-from sb3_dreamer_urlb import arguments, env_steps, phases
+from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb.dreamer_v2 import arguments
+from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, DreamerPolicy
+from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
-from sb3_dreamer_urlb.policies import ActingState, DreamerPolicy
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 if TYPE_CHECKING:

@@ -11,16 +11,16 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
-from sb3_dreamer_urlb.graphs import COMPILE
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
+from sb3_dreamer_urlb.learning.graphs import COMPILE
+from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
-from sb3_dreamer_urlb.precision import PRECISIONS
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
+from sb3_dreamer_urlb.spaces.actions import make_actions
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2

@@ -16,20 +16,23 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_dreamer_urlb import arguments, graphs, native, numerical_faults, phases, run_checkpoints, training_loop
-from sb3_dreamer_urlb.acting import ActingAlgorithm
-from sb3_dreamer_urlb.actions import make_actions
+from sb3_dreamer_urlb import native, phases
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
+from sb3_dreamer_urlb.callbacks import checkpoint as run_checkpoints
+from sb3_dreamer_urlb.dreamer_v2 import arguments, training_loop, transfer
+from sb3_dreamer_urlb.dreamer_v2.acting import ActingAlgorithm
+from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
+from sb3_dreamer_urlb.dreamer_v2.presets import with_preset
+from sb3_dreamer_urlb.dreamer_v2.saving import SavingAlgorithm
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
-from sb3_dreamer_urlb.last_state import save_last_good_state
-from sb3_dreamer_urlb.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.learning import graphs, numerical_faults
+from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import make_planner
-from sb3_dreamer_urlb.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
-from sb3_dreamer_urlb.presets import with_preset
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-from sb3_dreamer_urlb.run_folder import RunFolder
-from sb3_dreamer_urlb.saving import SavingAlgorithm
+from sb3_dreamer_urlb.runs.last_state import save_last_good_state
+from sb3_dreamer_urlb.runs.run_folder import RunFolder
+from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
@@ -355,7 +358,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
     # -- phases --------------------------------------------------------------------------------------------------------
 
     def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
-        """Leave pre-training: what ``phases.TRANSFER`` keeps stays, everything else starts afresh (paper §3).
+        """Leave pre-training: what ``transfer.TRANSFER`` keeps stays, everything else starts afresh (paper §3).
 
         The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
 
@@ -376,7 +379,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.replay_buffer.close()
         del self.replay_buffer
         self._build()
-        phases.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
+        transfer.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
         self._last_obs = None
 
     def fix_skill(self, skill: int | np.ndarray | None) -> None:
@@ -395,7 +398,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         agent = self.policy.agent
         if not isinstance(agent.intrinsic, SkillReward) or agent.explores:
             return
-        sequences = -(-max(phases.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
+        sequences = -(-max(transfer.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
         batch = self.replay_buffer.sample(sequences, env=self._vec_normalize_env)
         model = agent.world_model
         with th.no_grad():

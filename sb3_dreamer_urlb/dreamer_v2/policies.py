@@ -13,19 +13,19 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb import precision as precisions
-from sb3_dreamer_urlb.actions import make_actions
 from sb3_dreamer_urlb.agent import Agent
-from sb3_dreamer_urlb.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
+from sb3_dreamer_urlb.nn import precision as precisions
 from sb3_dreamer_urlb.number_checks import is_integer
-from sb3_dreamer_urlb.observation_checks import checked_observation
 from sb3_dreamer_urlb.planning import DynaMPC
-from sb3_dreamer_urlb.planning.prepared import planned
+from sb3_dreamer_urlb.planning.prepared.agent import planned
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
+from sb3_dreamer_urlb.spaces.actions import make_actions
+from sb3_dreamer_urlb.spaces.observation_checks import checked_observation
+from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations, vectors
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
-from sb3_dreamer_urlb.world_model.observations import DictObservations, Images, Observations, vectors
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 # Deterministic predictions draw their posterior states and planning noise from this seed, always the same.

@@ -10,9 +10,10 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_dreamer_urlb import arguments, run_folder
-from sb3_dreamer_urlb.learner import Learner
+from sb3_dreamer_urlb.dreamer_v2 import arguments
+from sb3_dreamer_urlb.learning.learner import Learner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.runs import run_folder
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target

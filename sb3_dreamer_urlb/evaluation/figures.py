@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch as th
 
+from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import pictures, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
-from sb3_dreamer_urlb.policies import DreamerPolicy
 
 MISSING_PLOTS = "Pictures need matplotlib and pillow: pip install 'sb3_dreamer_urlb[plots]'."
 CONTEXT = 5  # observations the model sees before it predicts on its own

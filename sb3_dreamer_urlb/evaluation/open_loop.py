@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch as th
 
-from sb3_dreamer_urlb.policies import DreamerPolicy
+from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
+from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size, map_observation
-from sb3_dreamer_urlb.world_model.observations import DictObservations, Images, Observations
 
 
 @th.no_grad()

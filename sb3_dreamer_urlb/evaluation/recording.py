@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_dreamer_urlb import arguments
+from sb3_dreamer_urlb.dreamer_v2 import arguments
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
 from sb3_dreamer_urlb.types import Observation
 

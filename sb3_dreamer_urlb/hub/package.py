@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb import arguments
+from sb3_dreamer_urlb.dreamer_v2 import arguments
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository

@@ -13,7 +13,7 @@ from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
 from sb3_dreamer_urlb.intrinsic.particles import check_neighbours, knn_distances
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.intrinsic.skills import UnitSkills
-from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
 # Distances below this share of their running mean count as none.

@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
 from sb3_dreamer_urlb.intrinsic.particles import check_neighbours, knn_distances
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.precision import full
 from sb3_dreamer_urlb.types import Imagination, ModelSizes
 
 

@@ -12,7 +12,7 @@ from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor
 from sb3_dreamer_urlb.intrinsic.base import RewardHead
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.intrinsic.skills import OneHotSkills
-from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
 

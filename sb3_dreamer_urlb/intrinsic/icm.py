@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
-from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.types import Metrics, ModelSizes, Posterior, SequenceBatch
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch as th
 
-from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
-from sb3_dreamer_urlb.nets import MLP
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
 

@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
-from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 

@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
-from sb3_dreamer_urlb.nets import ReLUNet
+from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.types import Metrics, ModelSizes, Observation, Posterior, SequenceBatch, map_observation
 

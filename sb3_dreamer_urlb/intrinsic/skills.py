@@ -9,7 +9,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.number_checks import check_integer
 
 

@@ -1,0 +1,1 @@
+"""One update: losses to optimisers, faults, CUDA graphs, memory."""

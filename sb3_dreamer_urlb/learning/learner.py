@@ -13,16 +13,17 @@ from dataclasses import dataclass, replace
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb import native, precision
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
 from sb3_dreamer_urlb.behavior.returns import lambda_return
-from sb3_dreamer_urlb.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
-from sb3_dreamer_urlb.memory import keep_freed_memory
-from sb3_dreamer_urlb.numerical_faults import UpdateGuard
-from sb3_dreamer_urlb.optim import ClippedAdam
+from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
+from sb3_dreamer_urlb.learning.memory import keep_freed_memory
+from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
+from sb3_dreamer_urlb.learning.optim import ClippedAdam
+from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 

@@ -1,8 +1,8 @@
 """Updates whose loss or gradient is not finite: skipped, counted, and the end of a run where they do not stop.
 
-The optimisers decide on the device whether they step (:class:`~sb3_dreamer_urlb.optim.ClippedAdam`); here are the counts, and
-the statistics that a bad batch must not spoil either. Only :meth:`UpdateGuard.repeated` and :meth:`UpdateGuard.total` wait
-for the device (spec/reliability "Long runs").
+The optimisers decide on the device whether they step (:class:`~sb3_dreamer_urlb.learning.optim.ClippedAdam`); here are the
+counts, and the statistics that a bad batch must not spoil either. Only :meth:`UpdateGuard.repeated` and
+:meth:`UpdateGuard.total` wait for the device.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_dreamer_urlb.agent import Agent
-from sb3_dreamer_urlb.optim import ClippedAdam
+from sb3_dreamer_urlb.learning.optim import ClippedAdam
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2

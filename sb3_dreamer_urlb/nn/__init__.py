@@ -1,0 +1,1 @@
+"""Layers, distributions, formats of products."""

@@ -14,9 +14,9 @@ from torch.autograd import Function
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.activation import elu_
 from sb3_dreamer_urlb.native import ops, product_ops
-from sb3_dreamer_urlb.precision import product_dtype
+from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.precision import product_dtype
 
 #: rows and inputs from which on laying an operand out pays
 ROWS, INPUTS = 1024, 1024

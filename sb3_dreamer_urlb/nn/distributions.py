@@ -16,7 +16,7 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import pixel_ops, planner_ops
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.precision import full
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 ACTION_MARGIN = 1e-6

@@ -9,8 +9,8 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb.dense import linear_elu
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.dense import linear_elu
+from sb3_dreamer_urlb.nn.precision import full
 
 
 class MLP(nn.Module):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch as th
 
-from sb3_dreamer_urlb import distributions
+from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.planning.dyna_mpc import DynaMPC, PlannableModel, PlannerConfig, _shifted
 from sb3_dreamer_urlb.types import LatentState
 

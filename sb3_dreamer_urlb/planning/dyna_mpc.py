@@ -10,8 +10,8 @@ from typing import Protocol
 
 import torch as th
 
-from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.behavior.returns import lambda_return
+from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number
 from sb3_dreamer_urlb.types import LatentState
 

@@ -22,13 +22,13 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_dreamer_urlb.actions import make_actions
-from sb3_dreamer_urlb.env_steps import is_fault
+from sb3_dreamer_urlb.envs.env_steps import is_fault
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
 from sb3_dreamer_urlb.replay.episode import Episode, RawObservation, observation_columns, observation_of
 from sb3_dreamer_urlb.replay.prefetch import Prefetcher
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, check_sampling, draw
+from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import SequenceBatch
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
 
 if TYPE_CHECKING:
-    from sb3_dreamer_urlb.policies import DreamerPolicy
+    from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 
 Policy = TypeVar("Policy", bound="DreamerPolicy")
 KIND = "policy"

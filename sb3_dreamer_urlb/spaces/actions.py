@@ -12,9 +12,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.choices import classes_of, one_hot_numbers
-from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.spaces.choices import classes_of, one_hot_numbers
+from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 
 
 class Actions(ABC):

@@ -16,10 +16,11 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from torch import nn
 
-from sb3_dreamer_urlb import distributions, native
-from sb3_dreamer_urlb.choices import classes_of, one_hot_numbers
-from sb3_dreamer_urlb.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import pixel_ops
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.spaces.choices import classes_of, one_hot_numbers
+from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.types import Metrics, Observation
 from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, DictDecoder, VectorDecoder
 from sb3_dreamer_urlb.world_model.encoder import ConvEncoder, DictEncoder, Encoder, VectorEncoder

@@ -27,10 +27,10 @@ from torch.autograd import Function
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.dense import column_sums
 from sb3_dreamer_urlb.native import image_ops, ops
-from sb3_dreamer_urlb.precision import product_dtype
+from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.dense import column_sums
+from sb3_dreamer_urlb.nn.precision import product_dtype
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in

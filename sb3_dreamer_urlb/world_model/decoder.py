@@ -9,9 +9,9 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb import native
-from sb3_dreamer_urlb.dense import linear, linear_elu
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.dense import linear, linear_elu
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve_elu, convolves_on_tiles
 
 

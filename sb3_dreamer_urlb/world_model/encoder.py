@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import full
 from sb3_dreamer_urlb.world_model.convolution import convolve, convolve_elu
 
 KERNEL, STRIDE = 4, 2

@@ -9,7 +9,7 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import planner_ops
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.precision import full
 
 #: rows from which on a kernel of our own pays
 NATIVE_ROWS = 256

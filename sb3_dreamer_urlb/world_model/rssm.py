@@ -6,10 +6,10 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.dense import linear, linear_elu
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.dense import linear, linear_elu
+from sb3_dreamer_urlb.nn.precision import full
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.gru import recur
 

@@ -8,12 +8,12 @@ from typing import Protocol
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.distributions import BoundedNormal, OneHotChoices
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.precision import short
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.distributions import BoundedNormal, OneHotChoices
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import short
+from sb3_dreamer_urlb.spaces.observations import Observations
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Observation, Posterior
-from sb3_dreamer_urlb.world_model.observations import Observations
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sb3_dreamer_urlb.phases import SNAPSHOT_FRAMES, SnapshotCallback
+from sb3_dreamer_urlb.callbacks.snapshot import SNAPSHOT_FRAMES, SnapshotCallback
 
 
 class RunSnapshotCallback(SnapshotCallback):

@@ -20,11 +20,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
+from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
+from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback
+from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
-from sb3_dreamer_urlb.phases import PRETRAINING, FineTuneCallback
-from sb3_dreamer_urlb.run_checkpoints import RunCheckpointCallback
-from sb3_dreamer_urlb.videos import VideoCallback
+from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.zoo import resuming
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params

@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.run_folder import SNAPSHOT, RunFolder, steps_done
+from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT, RunFolder, steps_done
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 #: a run's own checkpoint, in its folder

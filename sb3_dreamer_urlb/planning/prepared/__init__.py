@@ -1,0 +1,1 @@
+"""The planned agent in the forms that are fast on a CPU."""

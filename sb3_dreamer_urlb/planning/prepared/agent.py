@@ -9,10 +9,10 @@ import torch as th
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.behavior.actor_critic import SuccessorCritic
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.planning.native_parts import NativeDynamics, NativeHead
-from sb3_dreamer_urlb.planning.prepared_parts import Dynamics, Head, SampledState, Visited
-from sb3_dreamer_urlb.precision import product_dtype
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import product_dtype
+from sb3_dreamer_urlb.planning.prepared.native_parts import NativeDynamics, NativeHead
+from sb3_dreamer_urlb.planning.prepared.parts import Dynamics, Head, SampledState, Visited
 from sb3_dreamer_urlb.types import LatentState
 
 #: states scored at once: what a processor's cache holds

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch as th
 
 from sb3_dreamer_urlb.native import product_ops
-from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn.precision import full
+from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 
 
 class Chain:

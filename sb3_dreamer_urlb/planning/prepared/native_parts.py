@@ -7,12 +7,12 @@ from typing import cast
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
 from sb3_dreamer_urlb.native import planner_ops, rollout_ops
 from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.planning.chain import Chain
-from sb3_dreamer_urlb.planning.prepared_parts import SampledState, Visited
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.planning.prepared.chain import Chain
+from sb3_dreamer_urlb.planning.prepared.parts import SampledState, Visited
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 

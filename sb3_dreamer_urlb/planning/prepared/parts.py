@@ -13,11 +13,11 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_dreamer_urlb import distributions
-from sb3_dreamer_urlb.activation import elu_
-from sb3_dreamer_urlb.nets import MLP
-from sb3_dreamer_urlb.planning.prepacked import PrepackedLinear
-from sb3_dreamer_urlb.precision import full
+from sb3_dreamer_urlb.nn import distributions
+from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import full
+from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 import torch.nn.functional as F
 
-from sb3_dreamer_urlb.activation import elu_
+from sb3_dreamer_urlb.nn.activation import elu_
 
 
 class PrepackedLinear:

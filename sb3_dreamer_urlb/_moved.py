@@ -1,0 +1,71 @@
+"""Modules that lay elsewhere in version 0.1: their old names work until version 0.3, with a DeprecationWarning."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+ROOT = "sb3_dreamer_urlb"
+#: old name → new name, both below the package
+MOVED = {
+    "acting": "dreamer_v2.acting",
+    "actions": "spaces.actions",
+    "activation": "nn.activation",
+    "arguments": "dreamer_v2.arguments",
+    "choices": "spaces.choices",
+    "demo": "cli.demo",
+    "dense": "nn.dense",
+    "distributions": "nn.distributions",
+    "env_steps": "envs.env_steps",
+    "errors": "spaces.errors",
+    "graphs": "learning.graphs",
+    "last_state": "runs.last_state",
+    "learner": "learning.learner",
+    "memory": "learning.memory",
+    "methods_tour": "cli.methods_tour",
+    "nets": "nn.nets",
+    "numerical_faults": "learning.numerical_faults",
+    "observation_checks": "spaces.observation_checks",
+    "optim": "learning.optim",
+    "planning.chain": "planning.prepared.chain",
+    "planning.native_parts": "planning.prepared.native_parts",
+    "planning.prepacked": "planning.prepared.prepacked",
+    "planning.prepared_parts": "planning.prepared.parts",
+    "policies": "dreamer_v2.policies",
+    "precision": "nn.precision",
+    "presets": "dreamer_v2.presets",
+    "run_checkpoints": "callbacks.checkpoint",
+    "run_folder": "runs.run_folder",
+    "saving": "dreamer_v2.saving",
+    "training_loop": "dreamer_v2.training_loop",
+    "videos": "callbacks.videos",
+    "world_model.observations": "spaces.observations",
+}
+
+
+class _OldNames(MetaPathFinder, Loader):
+    """Finds a module under its old name and fills it with the new one's content."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Of a module that moved; None for all others."""
+        return ModuleSpec(fullname, self) if fullname.removeprefix(f"{ROOT}.") in MOVED else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Fill it."""
+        new = f"{ROOT}.{MOVED[module.__name__.removeprefix(f'{ROOT}.')]}"
+        warnings.warn(f"{module.__name__} is now {new}; the old name ends with version 0.3.", DeprecationWarning, stacklevel=2)
+        content = vars(import_module(new))
+        vars(module).update({name: value for name, value in content.items() if not name.startswith("__")})
+
+
+def keep_old_names() -> None:
+    """Let imports of old names succeed; may be called again."""
+    if not any(isinstance(finder, _OldNames) for finder in sys.meta_path):
+        sys.meta_path.append(_OldNames())

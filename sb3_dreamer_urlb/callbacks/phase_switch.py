@@ -1,0 +1,120 @@
+"""The callbacks that turn a run from pre-training to fine-tuning (paper §3 "Task-aware fine-tuning")."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.phases import PRETRAINING
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+
+class PhaseSwitchCallback(BaseCallback):
+    """Turn a run from pre-training to fine-tuning inside one ``model.learn(...)``.
+
+    The switch happens at the end of the rollout in which the phase's frames are reached, unless ``learn`` ends with it:
+    then the model stays pre-trained, and the next ``learn`` begins with the switch. It depends only on the model's own phase
+    and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless.
+
+    :param pretrain_frames: length of the pre-training in environment frames (agent steps × action repeat)
+    :param env: the fine-tuning environment; None stays in the same one
+    :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
+    :param keep_critic: for ablations
+    :param verbose: 1 prints the switch
+    :raises ValueError: for a number of frames that is not positive, and, when ``learn`` begins, for an ``env`` that does
+        not fit the model
+    """
+
+    def __init__(
+        self,
+        pretrain_frames: int = 2_000_000,
+        env: GymEnv | None = None,
+        keep_actor: bool | None = None,
+        keep_critic: bool = False,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if not is_integer(pretrain_frames) or pretrain_frames < 1:
+            raise ValueError(f"pretrain_frames must be a positive integer, got {pretrain_frames!r}.")
+        self.pretrain_frames = pretrain_frames
+        self.env = env
+        self.keep_actor = keep_actor
+        self.keep_critic = keep_critic
+
+    def _init_callback(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.intrinsic_reward is None and model.phase != PRETRAINING:
+            warnings.warn(
+                "PhaseSwitchCallback has nothing to switch: with intrinsic_reward=None the model learns the task at once."
+            )
+        if self.env is None:
+            return
+        # Now, not after the 2M frames of pre-training.
+        self.env = model.prepare_env(self.env)
+        resumed = model.run_folder is not None and model.run_folder.resumed
+        if resumed and model.phase != PRETRAINING and model.get_env() is not self.env:
+            # The run was resumed after the switch, with the pre-training's environment.
+            model.set_env(self.env)
+            model.restart_episodes()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_start(self) -> None:
+        # A learn() before this one, perhaps in another process, ended with the pre-training.
+        self._switch_if_due()
+
+    def _on_rollout_end(self) -> None:
+        # Between rollouts, because a rollout holds on to its environment and replay buffer. If no step is left for the
+        # task, the pre-trained agent is what the caller wants to have.
+        if self.model.num_timesteps < self.model._total_timesteps:
+            self._switch_if_due()
+
+    def _switch_if_due(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.phase != PRETRAINING or model.phase_frames < self.pretrain_frames:
+            return
+        if self.verbose >= 1:
+            print(f"Pre-training ends after {model.phase_frames} frames; fine-tuning begins.")
+        model.fine_tune(self.env, self.keep_actor, self.keep_critic)
+        model.restart_episodes()
+
+
+class FineTuneCallback(BaseCallback):
+    """Fine-tune a pre-trained snapshot from the first step of ``learn`` on: ``model.fine_tune()`` for configuration files.
+
+    A model that is fine-tuning already, because its run was cut off, goes on.
+
+    :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
+    :param keep_critic: for ablations
+    :param verbose: 1 prints what is fine-tuned
+    :raises ValueError: when ``learn`` begins, for a model that was not pre-trained
+    """
+
+    def __init__(self, keep_actor: bool | None = None, keep_critic: bool = False, verbose: int = 1):
+        super().__init__(verbose)
+        self.keep_actor = keep_actor
+        self.keep_critic = keep_critic
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_start(self) -> None:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.phase_timesteps == 0 and (model.phase == PRETRAINING or model.intrinsic_reward is None):
+            raise ValueError(
+                "FineTuneCallback needs a pre-trained model, this one has seen 0 frames: "
+                "load a snapshot with DreamerV2.load, or with rl_zoo3's -i."
+            )
+        if model.phase != PRETRAINING:
+            return
+        if self.verbose >= 1:
+            print(f"Fine-tuning what {model.phase_frames} frames of pre-training with {model.intrinsic_reward!r} left.")
+        model.fine_tune(keep_actor=self.keep_actor, keep_critic=self.keep_critic)
+        model.restart_episodes()

@@ -1,0 +1,62 @@
+"""The callback that saves pre-trained agents on the way (paper §2)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.phases import PRETRAINING
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+#: when the paper saves its pre-trained agents, in environment frames
+SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
+
+
+class SnapshotCallback(BaseCallback):
+    """Save the pre-training agent whenever it has seen given numbers of frames (paper §2).
+
+    Files are called ``<name_prefix>_<frames>.zip``.
+
+    :param save_path: folder, made if it does not exist
+    :param frames: when, in environment frames of the pre-training
+    :param name_prefix: of the files
+    :param verbose: 1 prints each path
+    :raises ValueError: for numbers of frames that are not positive
+    """
+
+    def __init__(
+        self,
+        save_path: str | os.PathLike[str],
+        frames: Sequence[int] = SNAPSHOT_FRAMES,
+        name_prefix: str = "snapshot",
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        if not isinstance(frames, Sequence) or any(not is_integer(frame) or frame < 1 for frame in frames):
+            raise ValueError(f"frames must be a sequence of positive integers, got {frames!r}.")
+        self.save_path = os.fspath(save_path)
+        self.frames = sorted(frames)
+        self.name_prefix = name_prefix
+        self.pending: list[int] = []
+
+    def _init_callback(self) -> None:
+        os.makedirs(self.save_path, exist_ok=True)
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        self.pending = [frame for frame in self.frames if frame > model.phase_frames]
+
+    def _on_step(self) -> bool:
+        model: DreamerV2 = self.model  # type: ignore[assignment]
+        if model.phase != PRETRAINING:
+            return True
+        while self.pending and model.phase_frames >= self.pending[0]:
+            path = os.path.join(self.save_path, f"{self.name_prefix}_{self.pending.pop(0)}.zip")
+            model.save(path)
+            if self.verbose >= 1:
+                print(f"Saved {path}")
+        return True

@@ -1,0 +1,39 @@
+"""What moves from a pre-trained DreamerV2 agent into a fine-tuning one (paper §3 "Task-aware fine-tuning")."""
+
+from __future__ import annotations
+
+from sb3_dreamer_urlb.agent import Agent
+
+KEPT, ACTOR_CHOICE, CRITIC_CHOICE, FRESH = "kept", "kept if keep_actor", "kept if keep_critic", "fresh"
+#: What a fine-tuning takes over from the pre-trained agent (spec/algorithms §4). Optimisers and replay always stay behind,
+#: and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
+TRANSFER: dict[str, str] = {
+    "world_model.encoder": KEPT,
+    "world_model.rssm": KEPT,
+    "world_model.decoder": KEPT,
+    "world_model.discount_logit": KEPT,
+    "world_model.reward": FRESH,
+    "actor": ACTOR_CHOICE,
+    "critic": CRITIC_CHOICE,
+    "slow_critic": CRITIC_CHOICE,
+    "reward_normalizer": FRESH,
+    # The skills of DIAYN and APS, and what APS chooses one by (spec/algorithms §6).
+    "intrinsic": KEPT,
+}
+
+#: replayed states by which DIAYN and APS choose the skill for a task (spec/algorithms §6)
+SKILL_STATES = 4096
+
+
+def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool) -> None:
+    """Copy what ``TRANSFER`` keeps from one agent into a fresh one of the same sizes.
+
+    :param source: pre-trained
+    :param target: fresh; changed in place
+    :param keep_actor: see ``TRANSFER``
+    :param keep_critic: see ``TRANSFER``
+    """
+    kept = {KEPT: True, ACTOR_CHOICE: keep_actor, CRITIC_CHOICE: keep_critic, FRESH: False}
+    parts = tuple(f"{name}." for name, rule in TRANSFER.items() if kept[rule])
+    state = {name: value for name, value in source.state_dict().items() if name.startswith(parts)}
+    target.load_state_dict(state, strict=False)

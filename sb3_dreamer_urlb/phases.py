@@ -1,0 +1,57 @@
+"""The two phases of the benchmark: what distinguishes them, and which domains' actors are kept from one to the other.
+
+Paper §2 "Unsupervised RL" and §3 "Task-aware fine-tuning".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What distinguishes a phase; everything else of the algorithm is the same in both.
+
+    :param explores: the intrinsic reward drives the actor, the task's reward does not reach the world model
+    :param random_warmup: the steps before the first update act uniformly at random, otherwise with the actor
+    :param plans: a planner, if one is set, acts
+    :param ent_coef: entropy bonus of the actor; None takes the intrinsic reward's own
+    """
+
+    explores: bool
+    random_warmup: bool
+    plans: bool
+    ent_coef: float | None
+
+
+PRETRAINING, FINETUNING = "pretraining", "finetuning"
+PHASES: dict[str, Phase] = {
+    PRETRAINING: Phase(explores=True, random_warmup=True, plans=False, ent_coef=None),
+    # Also a run from scratch, without pre-training: the paper's DreamerV2 baseline.
+    FINETUNING: Phase(explores=False, random_warmup=False, plans=True, ent_coef=1e-4),
+}
+
+#: Domains whose tasks give reward only in small regions: the pre-trained actor would drive away from them (paper §3).
+SPARSE_DOMAINS = ("jaco",)
+
+
+def keeps_actor(domain: str | None) -> bool:
+    """The paper's task-aware rule: keep the actor where rewards are dense, drop it where they are sparse.
+
+    :param domain: of the fine-tuning task; None for an environment that does not tell, which counts as dense
+    """
+    return domain not in SPARSE_DOMAINS
+
+
+def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None) -> float:
+    """The actor's entropy bonus: the user's if given, otherwise the phase's, otherwise the intrinsic reward's.
+
+    :param phase: a key of ``PHASES``
+    :param intrinsic: the intrinsic reward, None without
+    :param chosen: the user's
+    """
+    if chosen is not None:
+        return chosen
+    default = PHASES[phase].ent_coef
+    return intrinsic.ent_coef if default is None else default
