@@ -41,7 +41,7 @@ test-slow: setup-gl  ## run the long learning checks, one after the other (PYTES
 	$(BIN)/python -m pytest -m slow --timeout=0 $(PYTEST_ARGS)
 
 faults: setup-gl  ## inject faults for some minutes: kills, damaged files, dying workers; ends with a table (PYTEST_ARGS)
-	$(ONE_THREAD) $(BIN)/python tests/faults.py $(PYTEST_ARGS)
+	$(ONE_THREAD) $(BIN)/python tests/helpers/faults.py $(PYTEST_ARGS)
 
 format: setup  ## sort imports and format the code
 	$(BIN)/ruff check --select I --fix $(SOURCES)
@@ -67,7 +67,7 @@ bench: setup-gl  ## measure speed and memory on a CPU, ratios first, in under te
 	$(BIN)/python benchmarks/end_to_end.py --repeat 1 $(BENCH_ARGS)
 
 golden: setup  ## compare with the official implementation's numbers (GOLDEN: files)
-	$(BIN)/python tests/golden.py $(GOLDEN)
+	$(BIN)/python tests/helpers/golden.py $(GOLDEN)
 
 constraints:  ## make constraints.txt anew from setup.cfg's ranges
 	scripts/constraints.sh

@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb._moved import keep_old_names
 from sb3_dreamer_urlb.envs import register_envs
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ __all__ = [
 ]
 
 register_envs()
+keep_old_names()
 
 
 def __getattr__(name: str) -> Any:

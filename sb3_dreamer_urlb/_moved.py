@@ -51,9 +51,7 @@ MOVED = {
 class _OldNames(MetaPathFinder, Loader):
     """Finds a module under its old name and fills it with the new one's content."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Of a module that moved; None for all others."""
         return ModuleSpec(fullname, self) if fullname.removeprefix(f"{ROOT}.") in MOVED else None
 

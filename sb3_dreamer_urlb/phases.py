@@ -5,7 +5,9 @@ Paper §2 "Unsupervised RL" and §3 "Task-aware fine-tuning".
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 
@@ -55,3 +57,19 @@ def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None) -> float:
         return chosen
     default = PHASES[phase].ent_coef
     return intrinsic.ent_coef if default is None else default
+
+
+def __getattr__(name: str) -> Any:
+    # Until version 0.3: these lay here in version 0.1.
+    moved = {
+        **dict.fromkeys(("PhaseSwitchCallback", "FineTuneCallback"), "callbacks.phase_switch"),
+        **dict.fromkeys(("SnapshotCallback", "SNAPSHOT_FRAMES"), "callbacks.snapshot"),
+        **dict.fromkeys(("TRANSFER", "transfer"), "dreamer_v2.transfer"),
+    }
+    if name not in moved:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    new = f"sb3_dreamer_urlb.{moved[name]}"
+    warnings.warn(
+        f"{__name__}.{name} is now {new}.{name}; the old name ends with version 0.3.", DeprecationWarning, stacklevel=2
+    )
+    return getattr(import_module(new), name)

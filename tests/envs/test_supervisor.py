@@ -9,12 +9,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_envs import CounterEnv, counter
 from gymnasium import spaces
+from places import PYTHONPATH
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, SupervisedVecEnv, make_supervised_vec_env
@@ -247,7 +247,7 @@ def test_a_process_ends_although_its_worker_is_stopped():
         "if __name__ == '__main__':\n"
         "    env = t.make(1); env.reset(); pid = env.env_method('pid')[0]; os.kill(pid, signal.SIGSTOP); print(pid)"
     )
-    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parent.parent)])
+    path = PYTHONPATH
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, timeout=200, check=True)
     with pytest.raises(ProcessLookupError):

@@ -20,6 +20,7 @@ import yaml
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from places import ROOT
 from rl_zoo3.exp_manager import ExperimentManager
 from snapshot_files import code_events
 from stable_baselines3.common.env_util import make_vec_env
@@ -33,7 +34,6 @@ from sb3_dreamer_urlb.zoo import registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
-ROOT = Path(__file__).parent.parent
 CONFIGS = ROOT / "zoo_configs"
 METHODS = ("lbs", "plan2explore", "icm", "rnd", "apt", "diayn", "aps", "random")
 OTHERS = ("scratch", "finetune")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from places import ROOT, test_file
 import functools
 import io
 import os
@@ -170,10 +171,10 @@ def test_soak(tiny_model, tmp_path):
 def test_the_table_names_tests_that_exist():
     for injection, (tests, _) in INJECTIONS.items():
         for file, name in tests:
-            assert f"def test_{name}" in (Path(__file__).parent / f"test_{file}.py").read_text(), injection
+            assert f"def test_{name}" in test_file(file).read_text(), injection
 
 
 def test_the_page_shows_the_table():
-    page = (Path(__file__).parent.parent / "docs" / "reliability.md").read_text()
+    page = (ROOT / "docs" / "reliability.md").read_text()
     for injection, (_, outcome) in INJECTIONS.items():
         assert f"| {injection} | {outcome} |" in page

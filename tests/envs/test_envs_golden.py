@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import TESTS
 
 from sb3_dreamer_urlb.envs import URLB_TASKS, make_control_env, make_urlb_env
 
@@ -25,7 +26,7 @@ MEAN_COLOUR_TOLERANCE = 0.5  # of 255
 
 @functools.cache
 def golden() -> dict[str, Any]:
-    here = Path(__file__).parent
+    here = TESTS
     folders = [os.environ.get("SB3_DREAMER_GOLDEN"), here.parents[1] / "shared" / "golden", here / "golden"]
     path = next(path for folder in folders if folder and (path := Path(folder, "golden_envs.json")).is_file())
     return json.loads(path.read_text())

@@ -6,11 +6,11 @@ import configparser
 import fnmatch
 import threading
 import warnings
-from pathlib import Path
 
 import pytest
 import torch as th
 import torch.nn.functional as F
+from places import ROOT
 from tape import Tape
 from test_resume import crash
 from test_run_folder import everything, scramble, vec_env
@@ -312,7 +312,7 @@ def test_a_run_goes_on_bit_for_bit(kernels, always, tiny_model, tmp_path, capsys
 def test_wheels_hold_the_sources():
     """Without them every installed copy would run with torch's kernels, and say nothing."""
     setup = configparser.ConfigParser()
-    setup.read(Path(__file__).parent.parent / "setup.cfg")
+    setup.read(ROOT / "setup.cfg")
     patterns = setup["options.package_data"]["sb3_dreamer_urlb"].split()
     sources = [path for path in build.FOLDER.iterdir() if path.suffix in (".cpp", ".h")]
     assert len(sources) >= 2

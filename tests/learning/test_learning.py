@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 
-SCRIPT = Path(__file__).parent.parent / "benchmarks" / "vector_tasks.py"
+SCRIPT = ROOT / "benchmarks" / "vector_tasks.py"
 #: least mean return of 20 deterministic episodes; random actions give 22 and -1200
 LEAST = {"CartPole-v1": 400.0, "Pendulum-v1": -250.0}
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from places import ROOT
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from sb3_dreamer_urlb.intrinsic import particles as module
 from sb3_dreamer_urlb.intrinsic.particles import knn_distances
 
-BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "particles.py"
+BENCHMARK = ROOT / "benchmarks" / "particles.py"
 GROUPED = 2100  # enough particles for the search by groups, which needs 4 × 32 × (k + 4), and no multiple of 32
 EXACT = {"rtol": 1e-6, "atol": 0.0}  # another processor may sum in another order
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="no GPU"))]

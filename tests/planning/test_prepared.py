@@ -8,9 +8,10 @@ from planning_forms import METHODS, M, N, agent_and_skill, check_short_products,
 
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.nn import distributions
-from sb3_dreamer_urlb.planning.prepared.agent import PreparedAgent, planned, prepacked
-from sb3_dreamer_urlb.planning.prepared.agent import agent as prepared
-from sb3_dreamer_urlb.planning.prepared.agent import parts as prepared_parts
+from sb3_dreamer_urlb.planning.prepared import agent as prepared
+from sb3_dreamer_urlb.planning.prepared import parts as prepared_parts
+from sb3_dreamer_urlb.planning.prepared import prepacked
+from sb3_dreamer_urlb.planning.prepared.agent import PreparedAgent, planned
 from sb3_dreamer_urlb.types import LatentState
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch as th
+from places import ROOT
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "gpu.py"
+SCRIPT = ROOT / "benchmarks" / "gpu.py"
 SHORT = [
     "--preset=tiny", "--precision", "float32", "--repeat=1", "--env=noise", "--starts=110", "--warm-steps=115",
     "--chunk=4", "--run-seconds=0.1",

@@ -6,11 +6,11 @@ import importlib
 import json
 import math
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch as th
+from places import ROOT
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.envs import load_renderer
 from sb3_dreamer_urlb.nn.dense import linear
 from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 WHERE = {
     "device",
     "cores",

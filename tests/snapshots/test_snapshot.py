@@ -13,7 +13,6 @@ import sys
 import time
 import zipfile
 from collections import deque
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from places import ROOT
 from snapshot_files import change_data, change_header, code_events, members, write
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -542,7 +542,7 @@ try:
 except SnapshotError:
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout
     assert int(out) < 50_000  # kB; the networks would take gigabytes
 
@@ -767,7 +767,7 @@ while True:
     model.save({str(path)!r})
     print("saved", flush=True)
 """
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     generator = np.random.default_rng(0)
     last = 24
     for _ in range(4):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from places import ROOT
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger, configure
@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_dreamer_urlb import PhaseSwitchCallback, VideoCallback
 
-PAGE = (Path(__file__).parent.parent / "docs" / "logging.md").read_text()
+PAGE = (ROOT / "docs" / "logging.md").read_text()
 METHODS = ("lbs", "plan2explore", "icm", "rnd", "apt", "diayn", "aps", "random")
 DICT = spaces.Dict({"a": spaces.Box(-1, 1, (3,), np.float32), "image": spaces.Box(0, 255, (16, 16, 3), np.uint8)})
 

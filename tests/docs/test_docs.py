@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from places import ROOT
 
 import sb3_dreamer_urlb
 from sb3_dreamer_urlb import dreamer_v2, envs, hub, planning
@@ -21,7 +22,6 @@ from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.intrinsic import registry
 
-ROOT = Path(__file__).parent.parent
 OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]
 PAGES = [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))

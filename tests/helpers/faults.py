@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from places import test_file
 
 #: injection → tests (file, then what the names of the tests begin with), outcome that they check
 INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
@@ -125,10 +125,9 @@ def main(arguments: list[str]) -> int:
     :param arguments: for pytest
     :return: exit status
     """
-    here = Path(__file__).parent
     files = sorted({file for tests, _ in INJECTIONS.values() for file, _ in tests})
     outcomes, start = Outcomes(), time.monotonic()
-    pytest.main(["-q", "-m", "faults or not slow", *(str(here / f"test_{file}.py") for file in files), *arguments], [outcomes])
+    pytest.main(["-q", "-m", "faults or not slow", *(str(test_file(file)) for file in files), *arguments], [outcomes])
     print("\n| injection | outcome | tests | seconds |\n|---|---|---|---|")
     bad = False
     for injection, (tests, expected) in INJECTIONS.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from places import PYTHONPATH
 import hashlib
 import os
 import random
@@ -289,7 +290,7 @@ def a_run(folder: str, total: int, pause: float = 0.0) -> None:
 
 def spawn(folder: Path, total: int, pause: float = 0.0) -> subprocess.Popen:
     code = f"import test_run_folder as t; t.a_run({str(folder)!r}, {total}, {pause})"
-    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parent.parent)])
+    path = PYTHONPATH
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
 

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from places import PYTHONPATH
 from test_replay import ACTION, IMAGE, Streams, check_rows, decode, held, make_buffer
 from test_run_folder import SmallDisk, vec_env
 
@@ -93,7 +93,7 @@ def a_writer(path: str) -> None:
 
 def test_kill_while_writing(tmp_path):
     """After each kill the file holds whole episodes, the newest that fit, none between missing."""
-    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parent.parent)])
+    path = PYTHONPATH
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     generator = np.random.default_rng(0)
     for kill in range(2):

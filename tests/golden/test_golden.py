@@ -8,8 +8,8 @@ from pathlib import Path
 import golden
 import numpy as np
 import pytest
+from places import TESTS
 
-TESTS = Path(__file__).parent
 FILES = ["dreamer_finetune.npz", "lbs_pretrain.npz"]
 OTHERS = [f"{name}_pretrain.npz" for name in ("icm", "plan2explore", "rnd", "apt", "diayn", "aps")]
 

@@ -1,4 +1,6 @@
-"""Compare this package with the authors' implementation: ``python tests/golden.py FILE...`` (form: tests/golden/README.md).
+"""Compare this package with the authors' implementation: ``python tests/helpers/golden.py FILE...``.
+
+The form of the files: tests/golden/README.md.
 
 Takes any file of that form: sizes, seeds and method come from the file. Prints one line a file with the worst error per
 group and exits with 1 beyond 1e-4 relative on outputs or 2e-5 absolute on weights.
@@ -28,7 +30,8 @@ from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
-from sb3_dreamer_urlb.planning.prepared.agent import native_parts, planned
+from sb3_dreamer_urlb.planning.prepared import native_parts
+from sb3_dreamer_urlb.planning.prepared.agent import planned
 from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.types import LatentState, SequenceBatch
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
@@ -239,7 +242,7 @@ def _most_probable_and_probs(logits: th.Tensor, generator: th.Generator | None =
 @contextmanager
 def deterministic_draws() -> Iterator[None]:
     """A categorical draw is its most probable class, an actor's draw its mean; trajectories are imagined step by step, because
-    the pass that does many steps has its draws inside (tests/test_native_rollout.py: it does what steps do)."""
+    the pass that does many steps has its draws inside (tests/planning/test_native_rollout.py: it does what steps do)."""
     with (
         mock.patch.object(native_parts.NativeDynamics, "imagine", lambda *_: None),
         mock.patch.object(distributions, "draw_classes", lambda probs, generator=None: probs.argmax(-1)),
