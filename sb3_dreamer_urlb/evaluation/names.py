@@ -1,0 +1,124 @@
+"""What evaluations may be about: methods with their category, tasks, and what an id says. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sb3_dreamer_urlb.envs.registration import URLB_TASKS
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to explore, or a baseline.
+
+    :param label: in figures and tables
+    :param category: as the paper groups them (§2): ``data``, ``knowledge``, ``competence``, ``random``; ``none`` without
+        pre-training; ``other`` for methods from outside the package
+    """
+
+    label: str
+    category: str
+
+
+METHODS: dict[str, Method] = {
+    "icm": Method("ICM", "knowledge"),
+    "lbs": Method("LBS", "knowledge"),
+    "plan2explore": Method("P2E", "knowledge"),
+    "rnd": Method("RND", "knowledge"),
+    "disagreement": Method("Disagreement", "knowledge"),
+    "apt": Method("APT", "data"),
+    "aps": Method("APS", "competence"),
+    "diayn": Method("DIAYN", "competence"),
+    "random": Method("Random", "random"),
+    "dreamer": Method("DreamerV2", "none"),
+    "drqv2": Method("DrQv2", "none"),
+}
+
+#: what the same methods are called elsewhere → their name here
+ALIASES: dict[str, str] = {
+    "p2e": "plan2explore",
+    "dreamerv2": "dreamer",
+    "dreamer_v2": "dreamer",
+    "drq": "drqv2",
+    "drq_v2": "drqv2",
+    "drq-v2": "drqv2",
+}
+
+CATEGORIES: tuple[str, ...] = ("data", "knowledge", "competence", "random")
+
+#: ``<domain>-<task>`` of the benchmark, in the order of its table
+TASKS: tuple[str, ...] = tuple(f"{domain}-{task}" for domain, tasks in URLB_TASKS.items() for task in tasks)
+
+#: levels of the perturbations (paper, appendix "RWRL")
+LEVELS = ("easy", "medium", "hard")
+#: rewards of the reaching tasks (paper, appendix "On the sparsity of the Jaco tasks")
+VARIANTS = ("fixed", "sparse", "dense")
+
+
+class UnknownName(ValueError):
+    """A task, a method or a unit that nobody knows: it is refused, as scores of it would mean nothing."""
+
+
+def method_name(name: str, also: Iterable[str] = ()) -> str:
+    """The name of a method as this package writes it.
+
+    :param name: as somebody wrote it
+    :param also: further names that are allowed
+    :raises UnknownName: listing the known ones
+    """
+    plain = name.strip().lower()
+    plain = ALIASES.get(plain, plain)
+    known = {*METHODS, *_registered(), *also}
+    if plain not in known:
+        raise UnknownName(f"unknown method {name!r}; known are {', '.join(sorted(known))}")
+    return plain
+
+
+def method(name: str) -> Method:
+    """Label and category of a method.
+
+    :param name: known or not
+    """
+    return METHODS.get(name, Method(name, "other"))
+
+
+def task_name(domain: str, task: str, also: Iterable[str] = ()) -> str:
+    """``<domain>-<task>``.
+
+    :param domain: of the task
+    :param task: in that domain
+    :param also: further tasks that are allowed, written ``<domain>-<task>``
+    :raises UnknownName: listing the known ones
+    """
+    name, known = f"{domain}-{task}", (*TASKS, *also)
+    if name not in known:
+        raise UnknownName(f"unknown task {name!r}; known are {', '.join(known)}")
+    return name
+
+
+_ID = re.compile(r"(?P<family>urlb|rwrl)/(?P<domain>[a-z]+)-(?P<task>[a-z_]+)(?:-(?P<change>[a-z]+))?-v\d+")
+
+
+def columns_of_id(env_id: str) -> dict[str, str]:
+    """What the id of an environment says about a row.
+
+    :param env_id: such as ``urlb/walker-run-v0``, ``rwrl/walker-walk-easy-v0``, ``urlb/jaco-reach_top_left-sparse-v0``
+    :return: ``domain`` and ``task``, with ``perturbation`` (a level) or ``variant`` where there is one; of another id
+        its name without the version as the task of the domain ``gymnasium``
+    """
+    found = _ID.fullmatch(env_id)
+    if found is None:
+        return {"domain": "gymnasium", "task": re.sub(r"-v\d+$", "", env_id)}
+    columns = {"domain": found["domain"], "task": found["task"]}
+    if found["change"]:
+        columns["variant" if found["change"] in VARIANTS else "perturbation"] = found["change"]
+    return columns
+
+
+def _registered() -> Iterable[str]:
+    # Methods that a program added itself: then the registry is imported already, and torch with it.
+    registry = sys.modules.get("sb3_dreamer_urlb.intrinsic.registry")
+    return () if registry is None else registry.registered_intrinsic_rewards()
