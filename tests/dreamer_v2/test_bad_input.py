@@ -42,7 +42,7 @@ def refused(tiny_model, monkeypatch):
     def check(message, env=None, error=ValueError, **kwargs):
         with monkeypatch.context() as patch:
             patch.setattr(policies, "WorldModel", build)
-            patch.setattr(dreamer_v2, "Learner", build)
+            patch.setattr(dreamer_v2.dreamer_v2, "Learner", build)
             with pytest.raises(error, match=message):
                 tiny_model(env, **kwargs)
 

@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from places import test_file
+from places import file_of
 
 #: injection → tests (file, then what the names of the tests begin with), outcome that they check
 INJECTIONS: dict[str, tuple[list[tuple[str, str]], str]] = {
@@ -127,7 +127,7 @@ def main(arguments: list[str]) -> int:
     """
     files = sorted({file for tests, _ in INJECTIONS.values() for file, _ in tests})
     outcomes, start = Outcomes(), time.monotonic()
-    pytest.main(["-q", "-m", "faults or not slow", *(str(test_file(file)) for file in files), *arguments], [outcomes])
+    pytest.main(["-q", "-m", "faults or not slow", *(str(file_of(file)) for file in files), *arguments], [outcomes])
     print("\n| injection | outcome | tests | seconds |\n|---|---|---|---|")
     bad = False
     for injection, (tests, expected) in INJECTIONS.items():

@@ -8,11 +8,11 @@ from pathlib import Path
 HELPERS = Path(__file__).parent
 TESTS = HELPERS.parent
 ROOT = TESTS.parent
-#: for programs that tests start: the package and the helpers
-PYTHONPATH = os.pathsep.join([str(ROOT), str(HELPERS)])
+#: for programs that tests start: the package, the helpers, and the test files, whose functions they call
+PYTHONPATH = os.pathsep.join(str(path) for path in (ROOT, HELPERS, *sorted(TESTS.iterdir())) if path.is_dir())
 
 
-def test_file(name: str) -> Path:
+def file_of(name: str) -> Path:
     """The file ``test_<name>.py``, in whichever room.
 
     :raises ValueError: if there is none, or more than one

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from places import ROOT, test_file
 import functools
 import io
 import os
@@ -14,6 +13,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from faults import INJECTIONS
+from places import ROOT, file_of
 from test_run_folder import everything, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
@@ -171,7 +171,7 @@ def test_soak(tiny_model, tmp_path):
 def test_the_table_names_tests_that_exist():
     for injection, (tests, _) in INJECTIONS.items():
         for file, name in tests:
-            assert f"def test_{name}" in test_file(file).read_text(), injection
+            assert f"def test_{name}" in file_of(file).read_text(), injection
 
 
 def test_the_page_shows_the_table():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from places import PYTHONPATH
 import hashlib
 import os
 import random
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 import torch as th
 from fake_envs import CounterEnv
+from places import PYTHONPATH
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv

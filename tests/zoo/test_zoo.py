@@ -20,7 +20,7 @@ import yaml
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from places import ROOT
+from places import PYTHONPATH, ROOT
 from rl_zoo3.exp_manager import ExperimentManager
 from snapshot_files import code_events
 from stable_baselines3.common.env_util import make_vec_env
@@ -207,7 +207,7 @@ def model_in(folder: Path, env: str = STAND) -> DreamerV2:
 
 def in_a_process(arguments: list[str], folder: Path, tests: bool = True) -> str:
     """Run Python with this checkout; gives what it printed."""
-    paths = [str(ROOT), *([str(ROOT / "tests")] if tests else [])]
+    paths = [PYTHONPATH if tests else str(ROOT)]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -17,6 +17,7 @@ import pandas
 import pytest
 import yaml
 from gymnasium.envs.registration import EnvSpec
+from places import PYTHONPATH
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv
 from test_run_folder import RepeatingEnv, everything
@@ -83,7 +84,7 @@ def crashed(crashing, steps, *arguments, **kwargs):
 
 def kill_when(folder: Path, arguments: list[str], run: Path, steps: int) -> None:
     """Start the command in a process of its own, and kill it when a checkpoint is of so many steps."""
-    paths = [str(ROOT), str(ROOT / "tests")]
+    paths = [PYTHONPATH]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1", "SECONDS_A_STEP": "0.02"}
     process = subprocess.Popen(
         [sys.executable, "-m", "sb3_dreamer_urlb.zoo", *arguments], cwd=folder, env=env, stdout=subprocess.DEVNULL
