@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import torch as th
-from torch import nn
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead
-from sb3_dreamer_urlb.nn.nets import ReLUNet
-from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.intrinsic.ensemble import Ensemble, check_ensemble_size
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
 
@@ -20,19 +18,16 @@ class Plan2Explore(IntrinsicReward):
 
     def __init__(self, ensemble_size: int = 5):
         super().__init__()
-        check_integer("ensemble_size", ensemble_size, 2)
+        check_ensemble_size(ensemble_size)
         self.ensemble_size = ensemble_size
 
     def build(self, sizes: ModelSizes) -> None:
-        widths = [sizes.feature + sizes.action, sizes.embed, sizes.embed]
-        self.models = nn.ModuleList(ReLUNet(widths) for _ in range(self.ensemble_size))
+        self.models = Ensemble([sizes.feature + sizes.action, sizes.embed, sizes.embed], self.ensemble_size)
 
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics]:
         """Distance (not squared) between predicted and next embedding, averaged over states and models."""
         inputs = th.cat([posterior.feature[:, :-1], batch.action[:, 1:]], -1)
-        target = posterior.embed[:, 1:]
-        loss = th.stack([(model(inputs) - target).norm(dim=-1).mean() for model in self.models]).mean()
-        return loss, {}
+        return self.models.loss(inputs, posterior.embed[:, 1:]), {}
 
     def reward(self, imagination: Imagination, reward_head: RewardHead) -> th.Tensor:
         """Variance over the models, averaged over the embedding; the first state, which nothing led to, gets 0.
@@ -40,5 +35,5 @@ class Plan2Explore(IntrinsicReward):
         Gradients reach the actor through the features only, not through the last action: as in the authors' code.
         """
         inputs = th.cat([imagination.feature[:-1], imagination.action[1:].detach()], -1)
-        disagreement = th.stack([model(inputs) for model in self.models]).var(0).mean(-1)
+        disagreement = self.models.disagreement(inputs)
         return th.cat([th.zeros_like(disagreement[:1]), disagreement])
