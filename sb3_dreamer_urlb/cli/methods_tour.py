@@ -21,7 +21,7 @@ from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.evaluation.scores import oracle
-from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward, registered_intrinsic_rewards
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward, make_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import check_positive
 
 COLUMNS = ("method", "updates", "intrinsic reward", "spread", "module's loss", "fine-tuned", "minutes", "")
@@ -58,7 +58,7 @@ class TourConfig:
     def __post_init__(self) -> None:
         oracle(self.task)
         get_preset(self.preset)
-        known = registered_intrinsic_rewards()
+        known: dict[str, type[IntrinsicReward]] = registered_intrinsic_rewards()
         unknown = sorted(set(self.methods) - set(known))
         if unknown:
             raise ValueError(f"Unknown methods {unknown}; known are {sorted(known)}.")

@@ -4,8 +4,10 @@ from sb3_dreamer_urlb.intrinsic.aps import APS
 from sb3_dreamer_urlb.intrinsic.apt import APT
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward, RewardHead, RewardSource
 from sb3_dreamer_urlb.intrinsic.diayn import DIAYN
+from sb3_dreamer_urlb.intrinsic.disagreement import Disagreement
 from sb3_dreamer_urlb.intrinsic.icm import ICM
 from sb3_dreamer_urlb.intrinsic.lbs import LBS
+from sb3_dreamer_urlb.intrinsic.method import ExplorationMethod
 from sb3_dreamer_urlb.intrinsic.plan2explore import Plan2Explore
 from sb3_dreamer_urlb.intrinsic.random_actions import RandomActions
 from sb3_dreamer_urlb.intrinsic.registry import (
@@ -17,6 +19,7 @@ from sb3_dreamer_urlb.intrinsic.registry import (
 from sb3_dreamer_urlb.intrinsic.rnd import RND
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.intrinsic.skills import OneHotSkills, Skills, UnitSkills
+from sb3_dreamer_urlb.intrinsic.transition_reward import EncodedSteps, EncoderSizes, TransitionReward
 
 __all__ = [
     "APS",
@@ -25,6 +28,10 @@ __all__ = [
     "ICM",
     "LBS",
     "RND",
+    "Disagreement",
+    "EncodedSteps",
+    "EncoderSizes",
+    "ExplorationMethod",
     "IntrinsicReward",
     "OneHotSkills",
     "Plan2Explore",
@@ -33,6 +40,7 @@ __all__ = [
     "RewardSource",
     "SkillReward",
     "Skills",
+    "TransitionReward",
     "UnitSkills",
     "get_intrinsic_reward",
     "make_intrinsic_reward",
@@ -48,3 +56,4 @@ register_intrinsic_reward("apt", APT)
 register_intrinsic_reward("diayn", DIAYN)
 register_intrinsic_reward("aps", APS)
 register_intrinsic_reward("random", RandomActions)
+register_intrinsic_reward("disagreement", Disagreement)

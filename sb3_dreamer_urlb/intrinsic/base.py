@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb.intrinsic.method import ExplorationMethod
 from sb3_dreamer_urlb.intrinsic.skills import Skills
 from sb3_dreamer_urlb.types import Imagination, Metrics, ModelSizes, Posterior, SequenceBatch
 
@@ -54,7 +54,7 @@ class RewardSource(nn.Module):
         return reward_head(imagination.seen)
 
 
-class IntrinsicReward(RewardSource):
+class IntrinsicReward(ExplorationMethod, RewardSource):
     """A reward the agent makes for itself while it pre-trains.
 
     A subclass takes its hyperparameters in ``__init__`` and makes its networks in :meth:`build`. Then it overrides any of
@@ -66,26 +66,12 @@ class IntrinsicReward(RewardSource):
     What snapshots must hold is a parameter or a buffer. See docs/howto/intrinsic_reward.md for an example.
     """
 
+    agent: ClassVar[str] = "DreamerV2"
     momentum: ClassVar[float] = 0.95
     #: entropy bonus of the actor while exploring with this reward
     ent_coef: ClassVar[float] = 0.0
-    #: False: nothing for an actor to learn, pre-training acts uniformly at random
-    trains_actor: ClassVar[bool] = True
-    #: False: something changes in Python from update to update, as a counter or a schedule, and a recorded update would not
-    #: see it (graphs.py); updates then run eager on CUDA, too
-    graph_safe: ClassVar[bool] = True
     #: the critic learns successor features ψ with value = ψ · w instead of values (APS)
     successor_features: ClassVar[bool] = False
-
-    #: what the constructor was called with, for files
-    constructor_kwargs: dict[str, Any]
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
-        self = super().__new__(cls)
-        given = inspect.signature(cls.__init__).bind_partial(self, *args, **kwargs).arguments
-        # A copy is made without arguments, and gets them with everything else.
-        self.__dict__["constructor_kwargs"] = dict(list(given.items())[1:])
-        return self
 
     def __init__(self) -> None:
         super().__init__()

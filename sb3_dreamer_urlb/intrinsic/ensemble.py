@@ -1,4 +1,4 @@
-"""An ensemble of one-step models and what it disagrees about: of Plan2Explore in imagination, of Disagreement on replayed steps.
+"""An ensemble of one-step models, and what it disagrees about: imagined steps (Plan2Explore) or replayed ones (Disagreement).
 
 r = mean over dimensions of Var_k f_k(x), where the f_k learn to predict the same target (Pathak et al., 2019; Sekar et al.,
 2020; paper appendix B).

@@ -4,65 +4,79 @@ from __future__ import annotations
 
 import copy
 import inspect
-from typing import Any
+from typing import Any, TypeVar
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
+from sb3_dreamer_urlb.intrinsic.method import ExplorationMethod
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 
-_REGISTRY: dict[str, type[IntrinsicReward]] = {}
+Method = TypeVar("Method", bound=ExplorationMethod)
+
+#: what is written for a method, whichever agent it is for
+_REGISTRY: dict[str, type[ExplorationMethod]] = {}
 
 
-def register_intrinsic_reward(name: str, method: type[IntrinsicReward]) -> None:
-    """Make ``DreamerV2(..., intrinsic_reward=name)`` use ``method``.
+def register_intrinsic_reward(name: str, method: type[ExplorationMethod]) -> None:
+    """Make ``DreamerV2(..., intrinsic_reward=name)`` use ``method``; ``DrQv2`` if it is a ``TransitionReward``.
 
     :param name: what users write
-    :param method: subclass of :class:`IntrinsicReward`
+    :param method: subclass of :class:`IntrinsicReward`, or of ``TransitionReward``
     :raises ValueError: if another class has that name already, or ``method`` is no such subclass
     """
-    if not (isinstance(method, type) and issubclass(method, IntrinsicReward)):
+    if not (isinstance(method, type) and issubclass(method, ExplorationMethod)):
         raise ValueError(f"The intrinsic reward {name!r} must be a subclass of IntrinsicReward, got {method!r}.")
     if _REGISTRY.get(name, method) is not method:
         raise ValueError(f"The intrinsic reward {name!r} is already {_REGISTRY[name].__qualname__}.")
     _REGISTRY[name] = method
 
 
-def get_intrinsic_reward(name: str) -> type[IntrinsicReward]:
+def get_intrinsic_reward(name: str, kind: type[Method] = IntrinsicReward) -> type[Method]:  # type: ignore[assignment]
     """The class registered as ``name``.
 
+    :param name: what users write
+    :param kind: base class of the methods that an agent can use
     :raises ValueError: for an unknown name; the message lists the known ones
     """
-    if name not in _REGISTRY:
-        raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(_REGISTRY)}, and None for the task's reward.")
-    return _REGISTRY[name]
+    known = registered_intrinsic_rewards(kind)
+    if name in known:
+        return known[name]
+    other = f" ({name!r} is for {_REGISTRY[name].agent})" if name in _REGISTRY else ""
+    raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(known)}, and None for the task's reward{other}.")
 
 
-def registered_intrinsic_rewards() -> dict[str, type[IntrinsicReward]]:
-    """All known methods by name."""
-    return dict(_REGISTRY)
+def registered_intrinsic_rewards(kind: type[Method] = IntrinsicReward) -> dict[str, type[Method]]:  # type: ignore[assignment]
+    """All known methods of a kind by name.
+
+    :param kind: base class of the methods that an agent can use
+    """
+    return {name: method for name, method in _REGISTRY.items() if issubclass(method, kind)}
 
 
 def make_intrinsic_reward(
-    method: str | type[IntrinsicReward] | IntrinsicReward | None, kwargs: dict[str, Any] | None = None
-) -> IntrinsicReward | None:
+    method: str | type[Method] | Method | None,
+    kwargs: dict[str, Any] | None = None,
+    kind: type[Method] = IntrinsicReward,  # type: ignore[assignment]
+) -> Method | None:
     """What the agent explores with, its networks not yet built.
 
     :param method: a registered name, a class, an instance (of which a copy is used), or None for the task's reward
     :param kwargs: hyperparameters for a name or a class
+    :param kind: base class of the methods that the agent can use
     :raises ValueError: for an unknown name, unknown or unfit hyperparameters, or anything else that is no intrinsic reward
     """
     if kwargs is not None and not isinstance(kwargs, dict):
         raise ValueError(f"intrinsic_kwargs must be a dictionary or None, got {kwargs!r}.")
     kwargs = kwargs or {}
-    if kwargs and (method is None or isinstance(method, IntrinsicReward)):
+    if kwargs and (method is None or isinstance(method, kind)):
         raise ValueError(f"intrinsic_kwargs={kwargs} need the name or the class of a method, got intrinsic_reward={method!r}.")
     if method is None:
         return None
-    if isinstance(method, IntrinsicReward):
+    if isinstance(method, kind):
         return _checked(copy.deepcopy(method))
-    chosen = get_intrinsic_reward(method) if isinstance(method, str) else method
-    if not (isinstance(chosen, type) and issubclass(chosen, IntrinsicReward)):
+    chosen = get_intrinsic_reward(method, kind) if isinstance(method, str) else method
+    if not (isinstance(chosen, type) and issubclass(chosen, kind)):
         raise ValueError(
-            f"intrinsic_reward must be a name, a subclass or an instance of IntrinsicReward, or None, got {method!r}."
+            f"intrinsic_reward must be a name, a subclass or an instance of {kind.__name__}, or None, got {method!r}."
         )
     # A class without a constructor of its own shows nn.Module's *args and **kwargs.
     known = {
@@ -76,7 +90,7 @@ def make_intrinsic_reward(
     return _checked(chosen(**kwargs))
 
 
-def _checked(made: IntrinsicReward) -> IntrinsicReward:
-    if made.skills is not None and not isinstance(made, SkillReward):
+def _checked(made: Method) -> Method:
+    if isinstance(made, IntrinsicReward) and made.skills is not None and not isinstance(made, SkillReward):
         raise ValueError(f"{type(made).__qualname__} has skills, so it must be a subclass of SkillReward, which chooses one.")
     return made

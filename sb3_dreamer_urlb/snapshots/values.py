@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward, get_intrinsic_reward, registered_intrinsic_rewards
+from sb3_dreamer_urlb.intrinsic import ExplorationMethod, get_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import CategoricalDynaMPC, DynaMPC, PlannerConfig
 
@@ -114,8 +114,8 @@ def contains_custom(value: Any) -> Custom | None:
 def _encode_intrinsic(value: Any) -> Any:
     """A registered class, or an instance that knows its keyword arguments, by the name it is registered under."""
     method = value if isinstance(value, type) else type(value)
-    names = [name for name, known in registered_intrinsic_rewards().items() if known is method]
-    if not issubclass(method, IntrinsicReward) or not names:
+    names = [name for name, known in registered_intrinsic_rewards(ExplorationMethod).items() if known is method]
+    if not issubclass(method, ExplorationMethod) or not names:
         raise Unstorable(f"A {method.__module__}.{method.__qualname__} cannot be stored")
     if isinstance(value, type):
         return {TAG: "intrinsic", "name": names[0]}
@@ -126,7 +126,7 @@ def _encode_intrinsic(value: Any) -> Any:
 
 
 def _intrinsic(name: str, kwargs: dict[str, Any] | None = None) -> Any:
-    method = get_intrinsic_reward(name)
+    method = get_intrinsic_reward(name, ExplorationMethod)
     return method if kwargs is None else method(**kwargs)
 
 
