@@ -55,6 +55,25 @@ class SequenceBatch:
 
 
 @dataclass
+class StepBatch:
+    """B steps of the replay with their n-step returns, for an agent without a world model; s frames make an observation.
+
+    :param observation: where each began, as the environment gave it, e.g. images, uint8 (B, s, C, height, width), oldest first
+    :param action: what was done there, float32 (B, A) in [-1, 1]
+    :param reward: discounted sum of the n rewards that followed, of fewer where the episode ended, float32 (B,)
+    :param discount: of the value where the return ends, float32 (B,): γ to the number of its rewards, 0 where the
+        environment terminated (not where it was truncated)
+    :param next_observation: where it ends, like ``observation``
+    """
+
+    observation: Observation
+    action: th.Tensor
+    reward: th.Tensor
+    discount: th.Tensor
+    next_observation: Observation
+
+
+@dataclass
 class LatentState:
     """The model state z of the paper: a stochastic and a deterministic part, both with the same leading shape.
 

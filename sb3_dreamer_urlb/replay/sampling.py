@@ -40,7 +40,7 @@ def _by_episode(rng: np.random.Generator, episodes: Sequence[Any], length: int, 
 
 def _by_row(rng: np.random.Generator, episodes: Sequence[Any], length: int, n: int) -> Iterator[Pieces]:
     """A row uniformly, then what follows it; the oldest episode follows the newest, so every row comes equally often."""
-    lengths = np.array(getattr(episodes, "lengths", None) or [len(episode) for episode in episodes])
+    lengths = episode_lengths(episodes)
     ends = lengths.cumsum()
     rows = rng.integers(ends[-1], size=n)
     for row, first in zip(rows, np.searchsorted(ends, rows, side="right"), strict=True):
@@ -52,3 +52,8 @@ def _by_row(rng: np.random.Generator, episodes: Sequence[Any], length: int, n: i
             missing -= stop - start
             index, start = (index + 1) % len(lengths), 0
         yield pieces
+
+
+def episode_lengths(episodes: Sequence[Any]) -> np.ndarray:
+    """Rows of each episode, int64; a store on disk knows them."""
+    return np.array(getattr(episodes, "lengths", None) or [len(episode) for episode in episodes])

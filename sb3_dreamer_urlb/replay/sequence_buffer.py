@@ -12,7 +12,7 @@ import math
 import os
 import warnings
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
 from sb3_dreamer_urlb.replay.episode import Episode, RawObservation, observation_columns, observation_of
 from sb3_dreamer_urlb.replay.prefetch import Prefetcher
-from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, check_sampling, draw
+from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, Pieces, check_sampling, draw
 from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import SequenceBatch
 
@@ -348,8 +348,12 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def _draws(self, rng: np.random.Generator, batch_size: int) -> list[gathering.Draw]:
         """Which rows make the sequences."""
-        places = draw(self.sampling, rng, self.episodes, self.batch_length, batch_size)
+        places = self._pieces(rng, batch_size)
         return [[(self.episodes[index], start, stop) for index, start, stop in pieces] for pieces in places]
+
+    def _pieces(self, rng: np.random.Generator, batch_size: int) -> Iterator[Pieces]:
+        """Where they lie."""
+        return draw(self.sampling, rng, self.episodes, self.batch_length, batch_size)
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device, non_blocking=True)
