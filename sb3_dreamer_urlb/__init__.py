@@ -13,6 +13,7 @@ from sb3_dreamer_urlb.envs import register_envs
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
+    from sb3_dreamer_urlb.callbacks.evaluation import EvaluationCallback
     from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback, PhaseSwitchCallback
     from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
     from sb3_dreamer_urlb.callbacks.videos import VideoCallback
@@ -28,6 +29,7 @@ _MODULES = {
     "CnnPolicy": "dreamer_v2.policies",
     "DreamerPolicy": "dreamer_v2.policies",
     "DreamerV2": "dreamer_v2",
+    "EvaluationCallback": "callbacks.evaluation",
     "FineTuneCallback": "callbacks.phase_switch",
     "IntrinsicReward": "intrinsic",
     "NumericalFaultError": "learning.numerical_faults",
@@ -47,6 +49,7 @@ __all__ = [
     "CnnPolicy",
     "DreamerPolicy",
     "DreamerV2",
+    "EvaluationCallback",
     "FineTuneCallback",
     "IntrinsicReward",
     "NumericalFaultError",

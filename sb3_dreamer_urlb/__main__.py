@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb demo|methods|convert``, or ``python -m sb3_dreamer_urlb demo|methods|convert``."""
+"""The command line: ``sb3-dreamer-urlb COMMAND``, or ``python -m sb3_dreamer_urlb COMMAND``; ``--help`` lists the commands."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+#: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
+MODULES = ("evaluate",)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,6 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     old.add_argument("old", type=Path)
     old.add_argument("new", type=Path)
     old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
+    modules = {name: import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
+    for name, module in modules.items():
+        module.add_arguments(commands.add_parser(name, help=module.HELP, description=module.__doc__))
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
     command = options.pop("command")
 
@@ -43,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         # Heavy imports only inside, so that --help answers at once.
+        if command in modules:
+            return int(modules[command].run(options))
         return {"demo": _demo, "methods": _methods, "convert": _convert}[command](options)
     except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)

@@ -1,0 +1,199 @@
+"""The callback that evaluates while fine-tuning, as the paper does: 10 episodes every 10k frames."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+
+from sb3_dreamer_urlb.evaluation.agent_rows import row_of
+from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row
+from sb3_dreamer_urlb.evaluation.episodes import AUTO, EPISODES, OFF, ON, PLANNERS, SEED, Evaluation, run_evaluation
+from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.phases import PHASES
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+
+#: two rows an evaluation: with the planner and without
+BOTH = "both"
+
+
+class EvaluationCallback(EvalCallback):
+    """Evaluate every so many frames of fine-tuning: SB3's ``evaluations.npz`` and rows of a CSV file.
+
+    An ``EvalCallback`` of Stable-Baselines3 that counts environment frames of the phase, plays the same seeds each time,
+    and leaves the random draws of the training alone. ``RunCheckpointCallback(..., evaluation=this)`` remembers it.
+
+    :param eval_env: to play in, not the training environment; as ``EvalCallback`` takes it
+    :param every_frames: of the phase
+    :param n_eval_episodes: how many, the paper's 10
+    :param rows: CSV file, several runs may share it; None writes none
+    :param log_path: folder of ``evaluations.npz``; None writes none
+    :param best_model_save_path: folder of ``best_model.zip``; None saves none
+    :param planner: ``"auto"`` as the agent acts at that time, ``"on"``, ``"off"``, or ``"both"``: a row with the planner, if
+        the model has one, and a row of the actor alone. ``evaluations.npz`` and ``eval/mean_reward`` have the first
+    :param pretraining: evaluate while pre-training, too
+    :param keep_actor: for the rows; None takes what the callback that switches the phase says, or the rule of the paper
+    :param keep_critic: likewise
+    :param columns: further columns of the rows, such as ``{"arm": "no bonus"}``
+    :param seed: of the first episode
+    :param kwargs: of ``EvalCallback``
+    :raises ValueError: for numbers that are not positive, and, when ``learn`` begins, for an environment that the model
+        trains in, rows of a model without a seed, or ``"on"`` without a planner
+    """
+
+    def __init__(
+        self,
+        eval_env: GymEnv,
+        every_frames: int = 10_000,
+        n_eval_episodes: int = EPISODES,
+        rows: str | os.PathLike[str] | None = None,
+        log_path: str | None = None,
+        best_model_save_path: str | None = None,
+        planner: str = AUTO,
+        pretraining: bool = False,
+        keep_actor: bool | None = None,
+        keep_critic: bool | None = None,
+        columns: dict[str, Any] | None = None,
+        seed: int = SEED,
+        **kwargs: Any,
+    ):
+        for name, value in (("every_frames", every_frames), ("n_eval_episodes", n_eval_episodes)):
+            check_integer(name, value, 1)
+        if planner not in (*PLANNERS, BOTH):
+            raise ValueError(f"planner must be one of {(*PLANNERS, BOTH)}, got {planner!r}.")
+        if not isinstance(eval_env, VecEnv):
+            one = eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env)
+            eval_env = DummyVecEnv([lambda: one])
+        super().__init__(
+            eval_env,
+            n_eval_episodes=n_eval_episodes,
+            log_path=None if log_path is None else os.fspath(log_path),
+            best_model_save_path=None if best_model_save_path is None else os.fspath(best_model_save_path),
+            **{"verbose": 0, "warn": False, **kwargs},
+        )
+        self.every_frames = every_frames
+        self.rows = None if rows is None else Path(rows)
+        self.planner = planner
+        self.pretraining = pretraining
+        self.keep_actor, self.keep_critic = keep_actor, keep_critic
+        self.columns = dict(columns or {})
+        self.seed = seed
+        self._due: tuple[str, int] = ("", 0)
+        self._beside: Sequence[BaseCallback] = ()
+
+    @property
+    def _dreamer(self) -> DreamerV2:
+        return self.model  # type: ignore[return-value]
+
+    def _init_callback(self) -> None:
+        training = self.model.get_env()
+        if training is not None and training.unwrapped is self.eval_env.unwrapped:
+            raise ValueError("EvaluationCallback needs an environment of its own, it was given the one that is trained in.")
+        for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
+            if folder:
+                os.makedirs(folder, exist_ok=True)
+        if self.callback_on_new_best is not None:
+            self.callback_on_new_best.init_callback(self.model)
+        normalized = [unwrap_vec_normalize(env) is not None for env in (training, self.eval_env) if env is not None]
+        if len(set(normalized)) > 1:
+            raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
+        if self.rows is not None and self.model.seed is None and "seed" not in self.columns:
+            raise ValueError("Rows tell runs apart by their seed: give the model one, or columns={'seed': ...}.")
+        if self.planner == ON and self._dreamer.planner is None:
+            raise ValueError("planner='on': the model has none.")
+        # An evaluation that was due before the run was cut off has been.
+        self._due = (self._dreamer.phase, self._dreamer.phase_frames // self.every_frames)
+
+    def _on_training_start(self) -> None:
+        # What ``learn`` was given, under SB3's name and under ours.
+        given = self.locals.get("callbacks", self.locals.get("callback"))
+        self._beside = getattr(given, "callbacks", ())
+
+    def _on_step(self) -> bool:
+        model = self._dreamer
+        phase, number = model.phase, model.phase_frames // self.every_frames
+        before = self._due[1] if self._due[0] == phase else 0
+        self._due = (phase, number)
+        if number <= before or (PHASES[phase].explores and not self.pretraining):
+            return True
+        return self.evaluate()
+
+    def evaluate(self) -> bool:
+        """Evaluate now.
+
+        :return: False to stop the training, as the callbacks below this one decide
+        """
+        evaluations = [
+            run_evaluation(self.model, self.eval_env, self.n_eval_episodes, self.seed, planner, self.deterministic)
+            for planner in self._planners()
+        ]
+        for evaluation in evaluations:
+            self._write_row(evaluation)
+        return self._log(evaluations[0])
+
+    def _planners(self) -> tuple[str, ...]:
+        if self.planner != BOTH:
+            return (self.planner,)
+        return (OFF,) if self._dreamer.planner is None or PHASES[self._dreamer.phase].explores else (ON, OFF)
+
+    def _write_row(self, evaluation: Evaluation) -> None:
+        if self.rows is None:
+            return
+        run = self._dreamer.run_folder
+        columns = {**({} if run is None else {"run_folder": run.path}), **self.columns}
+        keep_actor, keep_critic = self._kept()
+        try:
+            append_row(self.rows, row_of(self.model, self.eval_env, evaluation, keep_actor, bool(keep_critic), **columns))
+        except RowsDisagree as error:
+            # The first result stands, and hours of training are not thrown away for the second.
+            warnings.warn(str(error))
+
+    def _kept(self) -> tuple[bool | None, bool | None]:
+        """What the row says about the fine-tuning: as given, or as the callback beside this one has it."""
+        kept = [self.keep_actor, self.keep_critic]
+        for callback in self._beside:
+            for i, name in enumerate(("keep_actor", "keep_critic")):
+                if callback is not self and kept[i] is None:
+                    kept[i] = getattr(callback, name, None)
+        return kept[0], kept[1]
+
+    def _log(self, evaluation: Evaluation) -> bool:
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.evaluations_results.append(evaluation.returns)
+        self.evaluations_length.append(evaluation.lengths)
+        if self.log_path is not None:
+            np.savez(
+                self.log_path,
+                timesteps=self.evaluations_timesteps,
+                results=self.evaluations_results,
+                ep_lengths=self.evaluations_length,
+            )
+        self.last_mean_reward = evaluation.mean
+        if self.verbose >= 1:
+            frames = self._dreamer.phase_frames
+            print(f"Evaluation after {frames} frames: return {evaluation.mean:.1f} ± {evaluation.std:.1f}")
+        self.logger.record("eval/mean_reward", evaluation.mean)
+        self.logger.record("eval/mean_ep_length", float(np.mean(evaluation.lengths)))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        go_on = True
+        if evaluation.mean > self.best_mean_reward:
+            self.best_mean_reward = evaluation.mean
+            if self.best_model_save_path is not None:
+                self.model.save(os.path.join(self.best_model_save_path, "best_model"))
+            if self.callback_on_new_best is not None:
+                go_on = self.callback_on_new_best.on_step()
+        if self.callback is not None:
+            go_on = go_on and self._on_event()
+        return go_on

@@ -1,0 +1,141 @@
+"""Evaluate a saved agent as the paper does: 10 episodes with fixed seeds, deterministic, with or without the planner."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from sb3_dreamer_urlb.evaluation.episodes import Evaluation
+
+HELP = "evaluate a saved agent: episodes with fixed seeds, a row of a CSV file, evaluations.npz"
+BOTH = "both"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("snapshot", type=Path, help="what model.save wrote, or the folder of a run")
+    parser.add_argument("--env", required=True, help="id of the environment, such as urlb/walker-run-v0")
+    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
+    parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
+    parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
+    parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+    choices = ("auto", "on", "off", BOTH)
+    parser.add_argument("--planner", choices=choices, default="auto", help="who acts; both plays twice (default: %(default)s)")
+    parser.add_argument("--stochastic", action="store_true", help="explore as in training")
+    parser.add_argument("--rows", type=Path, help="CSV file that a row is added to")
+    parser.add_argument("--npz", type=Path, help="folder of evaluations.npz, as Stable-Baselines3's EvalCallback writes it")
+    parser.add_argument("--set", nargs="+", metavar="COLUMN=VALUE", help="columns of the row: arm=mine keep_actor=false")
+    parser.add_argument("--vec-normalize", type=Path, help="statistics of the observations, JSON (a run folder has its own)")
+    parser.add_argument("--device", default="auto", help="(default: %(default)s)")
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for options that do not fit the snapshot or each other
+    :raises FileNotFoundError: if there is no snapshot
+    """
+    import numpy as np
+
+    from sb3_dreamer_urlb.evaluation.agent_rows import results_of, row_of
+    from sb3_dreamer_urlb.evaluation.append import append_row
+    from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_integer("--episodes", options["episodes"], 1)
+    about = {"snapshot": options["snapshot"], **_columns(options.get("set", ()))}
+    envs = options.get("envs", min(options["episodes"], 10))
+    check_integer("--envs", envs, 1)
+    model, env = load_agent(options, envs)
+    if "rows" in options and model.seed is None and "seed" not in about:
+        env.close()
+        raise ValueError("The model has no seed, and rows tell runs apart by it: --set seed=...")
+    planner = options["planner"]
+    plan = ("on", "off") if planner == BOTH and model.planner is not None else ("off",) if planner == BOTH else (planner,)
+    evaluations = []
+    try:
+        for chosen in plan:
+            played = run_evaluation(model, env, options["episodes"], options["seed"], chosen, not options["stochastic"])
+            evaluations.append(played)
+            _print(options, played)
+            if "rows" in options:
+                row = row_of(model, env, played, **about)
+                print(f"  {'added to' if append_row(options['rows'], row) else 'stands already in'} {options['rows']}")
+    finally:
+        env.close()
+    if "npz" in options:
+        options["npz"].mkdir(parents=True, exist_ok=True)
+        np.savez(options["npz"] / "evaluations.npz", **results_of(evaluations[:1], [model.num_timesteps]))  # type: ignore[arg-type]
+    return 0
+
+
+def load_agent(options: dict[str, Any], envs: int) -> tuple[Any, VecEnv]:
+    """A saved agent and an environment for it.
+
+    :param options: of the command line: ``snapshot``, ``env``, ``device``, and, if given, ``env_kwargs``, ``vec_normalize``
+    :param envs: how many environments
+    """
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from sb3_dreamer_urlb import DreamerV2
+    from sb3_dreamer_urlb.evaluation.loading import normalized_as_saved
+    from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
+    from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
+
+    path = options["snapshot"]
+    path = path / SNAPSHOT if path.is_dir() else path
+    kwargs = {name: _typed(value) for name, value in _pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
+    env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
+    try:
+        statistics = options.get("vec_normalize")
+        env = normalized_as_saved(env, path) if statistics is None else load_vec_normalize(statistics, env)
+        return DreamerV2.load(path, env=env, device=options["device"]), env
+    except BaseException:
+        env.close()
+        raise
+
+
+def _pairs(option: str, texts: Any) -> dict[str, str]:
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise ValueError(f"{option}: expected NAME=VALUE, got {text!r}.")
+        pairs[name] = value
+    return pairs
+
+
+def _columns(texts: Any) -> dict[str, Any]:
+    from sb3_dreamer_urlb.evaluation.rows import REQUIRED
+
+    columns = {name: _typed(text) if name in REQUIRED else text for name, text in _pairs("--set", texts).items()}
+    for name in columns.keys() & {"keep_actor", "keep_critic"}:
+        if columns[name] is not None and not isinstance(columns[name], bool):
+            raise ValueError(f"--set {name}: expected true, false or none, got {columns[name]!r}.")
+    return columns
+
+
+def _typed(text: str) -> Any:
+    try:
+        return json.loads(text.lower() if text in ("True", "False") else text)
+    except ValueError:
+        return None if text.lower() == "none" else text
+
+
+def _print(options: dict[str, Any], played: Evaluation) -> None:
+    from sb3_dreamer_urlb.evaluation.names import TASKS, columns_of_id
+    from sb3_dreamer_urlb.evaluation.scores import normalized_score
+
+    who = "actor alone" if played.planner == "none" else f"planner {played.planner}"
+    line = f"{options['env']}, {who}: return {played.mean:.1f} ± {played.std:.1f} ({len(played.returns)} episodes"
+    name = "{domain}-{task}".format(**columns_of_id(options["env"]))
+    score = f", {100 * normalized_score(name, played.mean):.1f} % of Dreamer@2M" if name in TASKS else ""
+    print(f"{line}, {played.seconds:.0f} s){score}")

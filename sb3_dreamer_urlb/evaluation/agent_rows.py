@@ -1,0 +1,130 @@
+"""What a row says about the agent that was evaluated and the environment that it played in."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dreamer_urlb.evaluation.episodes import Evaluation
+from sb3_dreamer_urlb.evaluation.names import columns_of_id
+from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row
+from sb3_dreamer_urlb.phases import PHASES, keeps_actor
+
+#: classes of algorithms → what a run of theirs without pre-training is called
+FROM_SCRATCH = {"DreamerV2": "dreamer", "DrQv2": "drqv2"}
+PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3", "dm-control", "mujoco")
+
+
+def row_of(
+    model: Any,
+    env: VecEnv,
+    evaluation: Evaluation,
+    keep_actor: bool | None = None,
+    keep_critic: bool = False,
+    **columns: Any,
+) -> Row:
+    """One row about an evaluation.
+
+    :param model: that was evaluated
+    :param env: that it was evaluated in
+    :param evaluation: what came of it
+    :param keep_actor: whether its fine-tuning began with the pre-trained actor; None takes the rule of the paper (§3)
+    :param keep_critic: likewise for the critic
+    :param columns: further columns, or other values for required ones
+    """
+    facts = {**env_columns(env), **_agent_columns(model, keep_actor, keep_critic)}
+    facts |= {
+        "planner": evaluation.planner,
+        "return_mean": evaluation.mean,
+        "return_std": evaluation.std,
+        "episodes": len(evaluation.returns),
+        "seconds": round(evaluation.seconds, 3),
+        "evaluation_seed": evaluation.seed,
+        "returns": " ".join(f"{value:.6g}" for value in evaluation.returns),
+        "versions": versions(),
+        "device": str(getattr(model, "device", "")),
+        **columns,
+    }
+    further = {name: str(facts.pop(name)) for name in list(facts) if name not in REQUIRED}
+    return Row(**facts, further=further)
+
+
+def _agent_columns(model: Any, keep_actor: bool | None, keep_critic: bool) -> dict[str, Any]:
+    algorithm = type(model).__name__
+    reward = getattr(model, "intrinsic_reward", None)
+    exploring = PHASES[model.phase].explores if hasattr(model, "phase") else False
+    frames = int(getattr(model, "phase_frames", model.num_timesteps))
+    pretrained = frames if exploring else int(getattr(model, "pretrained_frames", 0))
+    if reward is None:
+        method = FROM_SCRATCH.get(algorithm, algorithm.lower())
+    else:
+        method = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
+    tuned = pretrained > 0 and not exploring
+    if tuned and keep_actor is None:
+        keep_actor = keeps_actor(getattr(model, "domain", None))
+    return {
+        "method": method,
+        "seed": -1 if model.seed is None else model.seed,
+        "pretrain_frames": pretrained,
+        "finetune_frames": 0 if exploring else frames,
+        "keep_actor": keep_actor if tuned else None,
+        "keep_critic": keep_critic if tuned else None,
+        "preset": getattr(model, "preset", ""),
+        "algorithm": algorithm,
+    }
+
+
+def env_columns(env: VecEnv) -> dict[str, Any]:
+    """Domain, task, and how the task is changed or seen, from the id of the environment and the arguments that made it.
+
+    :param env: vectorised
+    """
+    spec = _attribute(env, "spec")
+    columns: dict[str, Any] = {} if spec is None else dict(columns_of_id(spec.id))
+    given = {} if spec is None else spec.kwargs
+    if columns.get("domain", "gymnasium") == "gymnasium":
+        # An id without a domain of its own: what the environment says counts.
+        said = {name: given.get(name, _attribute(env, name)) for name in ("domain", "task")}
+        columns |= {name: value for name, value in said.items() if isinstance(value, str) and value}
+    columns.setdefault("domain", "gymnasium")
+    columns.setdefault("task", type(env).__name__)
+    if isinstance(given.get("observation"), str) and given["observation"] != "pixels":
+        columns["observation"] = given["observation"]
+    return columns
+
+
+def _attribute(env: VecEnv, name: str) -> Any:
+    try:
+        return env.get_attr(name, indices=0)[0]
+    except AttributeError:
+        return None
+
+
+def versions() -> str:
+    """Of Python and the packages that results depend on, and of this one."""
+    from sb3_dreamer_urlb import __version__
+
+    found = [f"sb3_dreamer_urlb {__version__}", f"python {platform.python_version()}"]
+    for package in PACKAGES:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(found)
+
+
+def results_of(evaluations: list[Evaluation], timesteps: list[int]) -> dict[str, np.ndarray]:
+    """As Stable-Baselines3 writes ``evaluations.npz``.
+
+    :param evaluations: with equally many episodes each
+    :param timesteps: agent steps of the model at each
+    """
+    return {
+        "timesteps": np.array(timesteps),
+        "results": np.array([evaluation.returns for evaluation in evaluations]),
+        "ep_lengths": np.array([evaluation.lengths for evaluation in evaluations]),
+    }

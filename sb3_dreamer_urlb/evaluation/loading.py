@@ -1,0 +1,31 @@
+"""An environment whose observations are normalised as a saved agent's were."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_dreamer_urlb.snapshots import normalization, tensors
+from sb3_dreamer_urlb.snapshots.archive import TENSORS, blaming, reading
+
+
+def normalized_as_saved(env: VecEnv, snapshot: Path) -> VecEnv:
+    """Wrap an environment in a VecNormalize with frozen statistics, if the agent needs one.
+
+    :param env: to play in
+    :param snapshot: of the agent; the checkpoint of a run folder holds the run's own statistics
+    :return: the environment, wrapped or as it was
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    with reading(snapshot, "model") as archive:
+        loaded = tensors.unpack(archive, TENSORS)
+        stored = {name: value for name, value in loaded.items() if name.startswith(normalization.PREFIX)}
+    if not stored:
+        return env
+    seen = any(name.startswith(f"{normalization.PREFIX}{normalization.OBSERVATION}") for name in stored)
+    keys = sorted({name.split("/", 1)[1].rsplit(".", 1)[0] for name in stored if "/" in name}) or None
+    wrapped = VecNormalize(env, training=False, norm_obs=seen, norm_reward=False, norm_obs_keys=keys)
+    with blaming(str(snapshot)):
+        normalization.restore(wrapped, stored)
+    return wrapped

@@ -1,0 +1,186 @@
+"""The callback that evaluates while fine-tuning, and the command that evaluates a snapshot."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from fake_envs import CounterEnv
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
+from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+
+WALKER = {"domain": "walker", "task": "run", "action_repeat": 2}
+
+
+@pytest.fixture(autouse=True)
+def _counter_env() -> Any:
+    gymnasium.register("Counter-v0", entry_point=CounterEnv, kwargs={"length": 20, **WALKER})
+    yield
+    del gymnasium.registry["Counter-v0"]
+
+
+def test_rows_and_evaluations_npz_of_a_run(tiny_model: Any, tmp_path: Path) -> None:
+    model = tiny_model(CounterEnv(20, **WALKER), intrinsic_reward="lbs")
+    rows = tmp_path / "rows.csv"
+    evaluation = EvaluationCallback(
+        CounterEnv(20, **WALKER), 40, 2, rows, log_path=str(tmp_path), best_model_save_path=str(tmp_path / "best"),
+        columns={"arm": "a"},
+    )  # fmt: skip
+    model.learn(100, callback=[PhaseSwitchCallback(64, keep_actor=False), evaluation])
+    found = read_rows(rows).rows
+    # 32 steps of pre-training, then 68 steps of two frames.
+    assert [row.finetune_frames for row in found] == [40, 80, 120]
+    assert {(row.method, row.pretrain_frames, row.keep_actor, row.episodes, row["arm"]) for row in found} == {
+        ("lbs", 64, False, 2, "a")
+    }
+    saved = np.load(tmp_path / "evaluations.npz")
+    assert saved["results"].shape == saved["ep_lengths"].shape == (3, 2)
+    assert list(saved["timesteps"]) == [52, 72, 92]
+    assert np.allclose(saved["results"].mean(1), [row.return_mean for row in found])
+    assert evaluation.best_mean_reward == max(row.return_mean for row in found)
+    assert DreamerV2.load(tmp_path / "best" / "best_model").phase == "finetuning"
+
+
+def test_both_rows_with_a_planner(tiny_model: Any, tmp_path: Path) -> None:
+    model = tiny_model(CounterEnv(20, **WALKER), planner="dyna_mpc", planner_delay=1000)
+    model.learn(20, callback=EvaluationCallback(CounterEnv(5, **WALKER), 40, 1, tmp_path / "rows.csv", planner="both"))
+    assert [(row.method, row.planner) for row in read_rows(tmp_path / "rows.csv").rows] == [
+        ("dreamer", "dyna_mpc"),
+        ("dreamer", "none"),
+    ]
+
+
+def test_a_run_that_goes_on_writes_each_row_once(tiny_model: Any, tmp_path: Path) -> None:
+    def go_on(steps: int) -> None:
+        evaluation = EvaluationCallback(CounterEnv(5, **WALKER), 20, 1, tmp_path / "rows.csv", log_path=str(tmp_path))
+        keep = RunCheckpointCallback(tmp_path / "run", 20, evaluation, resume="auto")
+        tiny_model(CounterEnv(20, **WALKER)).learn(steps, callback=[keep, evaluation])
+
+    go_on(25)
+    go_on(60)
+    found = read_rows(tmp_path / "rows.csv")
+    assert found.report() == "" and [row.finetune_frames for row in found.rows] == [20, 40, 60, 80, 100, 120]
+    assert found.rows[0]["run_folder"] == str(tmp_path / "run")
+    assert list(np.load(tmp_path / "evaluations.npz")["timesteps"]) == [10, 20, 30, 40, 50, 60]
+
+
+def test_a_result_that_contradicts_the_file_does_not_end_the_run(tiny_model: Any, tmp_path: Path) -> None:
+    for length, warned in ((5, False), (6, True)):
+        callback = EvaluationCallback(CounterEnv(length, **WALKER), 20, 1, tmp_path / "rows.csv")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            tiny_model(CounterEnv(20, **WALKER)).learn(10, callback=callback)
+        assert any("another result of the same run" in str(one.message) for one in caught) is warned
+    assert len(read_rows(tmp_path / "rows.csv").rows) == 1
+
+
+def test_learning_is_not_touched(tiny_model: Any, weights: Any) -> None:
+    learnt = []
+    for callback in (None, EvaluationCallback(CounterEnv(20), 10, 1)):
+        model = tiny_model(CounterEnv(20), learning_starts=20)
+        learnt.append(weights(model.learn(60, callback=callback).policy))
+    assert learnt[0] == learnt[1]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"every_frames": 0}, "every_frames must be an integer of at least 1, got 0"),
+        ({"n_eval_episodes": 1.5}, "n_eval_episodes must be an integer"),
+        ({"planner": "yes"}, "planner must be one of"),
+    ],
+)
+def test_bad_input(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        EvaluationCallback(CounterEnv(), **kwargs)
+
+
+def test_what_cannot_work_is_said_before_learning(tiny_model: Any, tmp_path: Path) -> None:
+    model = tiny_model()
+    with pytest.raises(ValueError, match="the one that is trained in"):
+        model.learn(5, callback=EvaluationCallback(model.get_env()))
+    with pytest.raises(ValueError, match="planner='on': the model has none"):
+        model.learn(5, callback=EvaluationCallback(CounterEnv(), planner="on"))
+    with pytest.raises(ValueError, match="Rows tell runs apart by their seed"):
+        tiny_model(seed=None).learn(5, callback=EvaluationCallback(CounterEnv(), rows=tmp_path / "rows.csv"))
+    with pytest.raises(ValueError, match="VecNormalize"):
+        model.learn(5, callback=EvaluationCallback(VecNormalize(DummyVecEnv([CounterEnv]))))
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_evaluates_a_snapshot(tiny_model: Any, tmp_path: Path, capsys: Any) -> None:
+    tiny_model(CounterEnv(20, **WALKER), planner="dyna_mpc").save(tmp_path / "agent")
+    command = ["evaluate", str(tmp_path / "agent.zip"), "--env", "Counter-v0", "--episodes", "2", "--planner", "both"]
+    command += [
+        "--rows",
+        str(tmp_path / "rows.csv"),
+        "--npz",
+        str(tmp_path),
+        "--set",
+        "arm=a",
+        "device=cpu",
+        "--device",
+        "cpu",
+    ]
+    assert main(command) == 0
+    rows = read_rows(tmp_path / "rows.csv").rows
+    assert [(row.planner, row.episodes, row["arm"], row.domain) for row in rows] == [
+        ("dyna_mpc", 2, "a", "walker"),
+        ("none", 2, "a", "walker"),
+    ]
+    assert np.load(tmp_path / "evaluations.npz")["results"].shape == (1, 2)
+    out = capsys.readouterr().out
+    assert "planner dyna_mpc: return" in out and "actor alone: return" in out and out.count("added to") == 2
+    assert main(command) == 0 and capsys.readouterr().out.count("stands already in") == 2
+
+
+def test_the_command_takes_a_run_folder_with_its_statistics(tiny_model: Any, tmp_path: Path) -> None:
+    def normalized() -> VecNormalize:
+        return VecNormalize(make_vec_env("Pendulum-v1", 1, seed=0), norm_reward=False)
+
+    model = tiny_model(normalized(), "MlpPolicy")
+    model.learn(30, callback=RunCheckpointCallback(tmp_path / "run"))
+    rows = tmp_path / "rows.csv"
+    arguments = ["--env", "Pendulum-v1", "--episodes", "2", "--envs", "1", "--rows", str(rows), "--device", "cpu"]
+    assert main(["evaluate", str(tmp_path / "run"), *arguments]) == 0
+    [row] = read_rows(rows, strict=False).rows
+    evaluation = EvaluationCallback(normalized(), 10, 2)
+    evaluation.init_callback(model)
+    evaluation.evaluate()
+    assert row.return_mean == pytest.approx(evaluation.last_mean_reward, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--episodes", "0"], "--episodes must be an integer of at least 1, got 0"),
+        (["--set", "arm"], "--set: expected NAME=VALUE, got 'arm'"),
+        (["--set", "keep_actor=perhaps", "--rows", "rows.csv"], "expected true, false or none, got 'perhaps'"),
+        (["--planner", "on"], "the model has none"),
+        (["--env-kwargs", "length"], "--env-kwargs: expected NAME=VALUE"),
+    ],
+)
+def test_the_command_says_what_is_wrong(
+    arguments: list[str], message: str, tiny_model: Any, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tiny_model(CounterEnv(20, **WALKER)).save(tmp_path / "agent")
+    assert (
+        main(["evaluate", "agent.zip", "--env", "Counter-v0", "--device", "cpu", "--env-kwargs", "length=3", *arguments]) == 2
+    )
+    assert message in capsys.readouterr().err
+
+
+def test_no_snapshot(tmp_path: Path, capsys: Any) -> None:
+    assert main(["evaluate", str(tmp_path / "none.zip"), "--env", "Counter-v0"]) == 2
+    assert "none.zip" in capsys.readouterr().err

@@ -1,0 +1,165 @@
+"""The one evaluation: fixed seeds in any VecEnv, with or without the planner, and what a row says about it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from fake_envs import CounterEnv
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from sb3_dreamer_urlb.evaluation.agent_rows import env_columns, row_of
+from sb3_dreamer_urlb.evaluation.append import append_row
+from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
+from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+
+
+class SeedEnv(gymnasium.Env):
+    """Its reward is the seed of the episode, its length follows from it: what was played can be told."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.value, self.steps = -1 if seed is None else seed, 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return np.ones(2, np.float32), float(self.value), False, self.steps >= 2 + self.value % 3, {}
+
+
+class Still:
+    """A model of anybody's."""
+
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        return np.zeros((len(observation), 1), np.float32), None
+
+
+def seeds(count: int, vec_env: Any = DummyVecEnv) -> Any:
+    kwargs = {"start_method": "forkserver"} if vec_env is SubprocVecEnv else {}
+    return vec_env([SeedEnv] * count, **kwargs)
+
+
+@pytest.mark.parametrize(("count", "vec_env"), [(1, DummyVecEnv), (3, DummyVecEnv), (10, DummyVecEnv), (2, SubprocVecEnv)])
+def test_the_same_episodes_in_any_vec_env(count: int, vec_env: Any) -> None:
+    env = seeds(count, vec_env)
+    played = run_evaluation(Still(), env, episodes=7, seed=50)
+    env.close()
+    assert played.lengths == [2 + (50 + i) % 3 for i in range(7)]
+    assert played.returns == [(50 + i) * length for i, length in enumerate(played.lengths)]
+    assert (played.planner, played.seed) == ("none", 50)
+    assert played.mean == pytest.approx(np.mean(played.returns)) and played.std == pytest.approx(np.std(played.returns))
+
+
+def test_a_vec_normalize_neither_moves_nor_counts() -> None:
+    env = VecNormalize(seeds(2), clip_reward=1.0)
+    played = run_evaluation(Still(), env, episodes=2, seed=50)
+    assert played.returns == [50 * 4, 51 * 2]
+    assert env.training and env.obs_rms.count == pytest.approx(1e-4) and env.ret_rms.count == pytest.approx(1e-4)
+
+
+def test_a_monitor_below_a_wrapper_that_changes_rewards_counts() -> None:
+    env = DummyVecEnv([lambda: gymnasium.wrappers.TransformReward(Monitor(SeedEnv()), lambda reward: 0.0)])
+    assert run_evaluation(Still(), env, episodes=1, seed=51).returns == [51 * 2]
+
+
+def test_it_equals_sb3_s_loop_and_our_own(tiny_model: Any) -> None:
+    model = tiny_model(CounterEnv(20))
+    own = run_evaluation(model, DummyVecEnv([lambda: Monitor(CounterEnv(20))]), episodes=2)
+    sb3, _ = evaluate_policy(model, Monitor(CounterEnv(20)), 2, return_episode_rewards=True, warn=False)
+    assert own.returns == pytest.approx(sb3)
+    assert own.returns == pytest.approx(evaluate(model, CounterEnv(20), 2))
+
+
+def test_training_s_random_draws_stay_untouched(tiny_model: Any) -> None:
+    model = tiny_model()
+    before = th.get_rng_state()
+    run_evaluation(model, DummyVecEnv([CounterEnv]), episodes=1, deterministic=False)
+    assert th.equal(before, th.get_rng_state())
+
+
+def test_an_evaluation_can_be_repeated(tiny_model: Any) -> None:
+    model, env = tiny_model(SeedEnv(), "MlpPolicy"), seeds(2)
+    first = run_evaluation(model, env, episodes=3, deterministic=False)
+    th.manual_seed(7)
+    assert run_evaluation(model, env, episodes=3, deterministic=False).returns == first.returns
+
+
+def test_the_planner_is_switched_for_the_evaluation_only(tiny_model: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model(planner="dyna_mpc", planner_delay=0, learning_starts=0)
+    planned: list[bool] = []
+    choose = model.policy.choose
+
+    def watched(*arguments: Any) -> Any:
+        planned.append(model.policy.planning)
+        return choose(*arguments)
+
+    monkeypatch.setattr(model.policy, "choose", watched)
+    before = model.policy.planning
+    for planner, plans in (("on", True), ("off", False), ("auto", True)):
+        planned.clear()
+        played = run_evaluation(model, DummyVecEnv([lambda: CounterEnv(3)]), episodes=1, planner=planner)
+        assert planned == [plans] * 3 and played.planner == ("dyna_mpc" if plans else "none")
+    assert model.policy.planning is before
+    model.planner_delay = 100
+    assert run_evaluation(model, DummyVecEnv([lambda: CounterEnv(3)]), episodes=1).planner == "none"
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"episodes": 0}, "episodes must be an integer of at least 1, got 0"),
+        ({"seed": -1}, "seed must be an integer of at least 0"),
+        ({"planner": "maybe"}, "planner must be one of .*'maybe'"),
+        ({"planner": "on"}, "the model has none"),
+    ],
+)
+def test_bad_input(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        run_evaluation(Still(), seeds(1), **kwargs)
+
+
+def test_a_row_says_who_played_where(tiny_model: Any, tmp_path: Any) -> None:
+    model = tiny_model(CounterEnv(20, domain="jaco", action_repeat=2), intrinsic_reward="apt", intrinsic_kwargs={"k": 3})
+    model.learn(32)
+    env = DummyVecEnv([lambda: CounterEnv(20, domain="jaco", task="reach_top_left")])
+    pretrained = row_of(model, env, run_evaluation(model, env, 1))
+    assert (pretrained.pretrain_frames, pretrained.finetune_frames, pretrained.keep_actor) == (64, 0, None)
+    model.fine_tune()
+    model.learn(12)
+    row = row_of(model, env, run_evaluation(model, env, 2), arm="mine")
+    assert (row.method, row.domain, row.task, row.seed) == ("apt", "jaco", "reach_top_left", 0)
+    assert (row.pretrain_frames, row.finetune_frames, row.preset, row.episodes) == (64, 24, "tiny", 2)
+    assert (row.keep_actor, row.keep_critic, row.planner) == (False, False, "none")
+    assert row["arm"] == "mine" and "torch" in row["versions"] and len(row["returns"].split()) == 2
+    append_row(tmp_path / "rows.csv", row)
+    assert read_rows(tmp_path / "rows.csv").rows[0].key == row.key
+
+
+def test_a_row_about_somebody_else_s_model() -> None:
+    model = PPO("MlpPolicy", "Pendulum-v1", seed=3, n_steps=8, batch_size=8)
+    env = make_vec_env("Pendulum-v1", 1)
+    row = row_of(model, env, run_evaluation(model, env, 1))
+    assert (row.method, row.domain, row.task, row.seed, row.keep_actor) == ("ppo", "gymnasium", "Pendulum", 3, None)
+
+
+def test_columns_of_the_environment() -> None:
+    env = make_vec_env("urlb/dm_control-v0", 1, env_kwargs={"domain": "cartpole", "task": "balance"})
+    assert env_columns(env) == {"domain": "cartpole", "task": "balance"}
+    env.close()
+    assert env_columns(seeds(1)) == {"domain": "gymnasium", "task": "DummyVecEnv"}
+
+
+def test_random_actions_for_comparison() -> None:
+    env = CounterEnv(20)
+    assert evaluate(RandomPolicy(env.action_space), env, 1) == [pytest.approx(sum((0.0, 1.0, 0.5)[i % 3] for i in range(20)))]
