@@ -73,7 +73,7 @@ def _methods(options: dict[str, Any]) -> int:
 
 
 def _convert(options: dict[str, Any]) -> int:
-    from sb3_dreamer_urlb.snapshots.convert import convert
+    from sb3_dreamer_urlb.cli.convert import convert
 
     model = convert(**options)
     print(f"Wrote {options['new']}: {model.phase}, {model.phase_frames} frames.")

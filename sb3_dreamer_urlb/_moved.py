@@ -13,7 +13,7 @@ from types import ModuleType
 ROOT = "sb3_dreamer_urlb"
 #: old name → new name, both below the package
 MOVED = {
-    "acting": "dreamer_v2.acting",
+    "acting": "algorithm.phased",
     "actions": "spaces.actions",
     "activation": "nn.activation",
     "arguments": "dreamer_v2.arguments",
@@ -23,6 +23,7 @@ MOVED = {
     "distributions": "nn.distributions",
     "env_steps": "envs.env_steps",
     "errors": "spaces.errors",
+    "evaluation.history": "runs.evaluation_history",
     "graphs": "learning.graphs",
     "last_state": "runs.last_state",
     "learner": "learning.learner",
@@ -41,8 +42,9 @@ MOVED = {
     "presets": "dreamer_v2.presets",
     "run_checkpoints": "callbacks.checkpoint",
     "run_folder": "runs.run_folder",
-    "saving": "dreamer_v2.saving",
-    "training_loop": "dreamer_v2.training_loop",
+    "saving": "algorithm.saving",
+    "snapshots.convert": "cli.convert",
+    "training_loop": "algorithm.training_loop",
     "videos": "callbacks.videos",
     "world_model.observations": "spaces.observations",
 }

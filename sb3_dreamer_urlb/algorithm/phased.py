@@ -1,143 +1,139 @@
-"""What the algorithm does with its environments: acts in them, and keeps what they gave. SB3's hooks of collecting."""
+"""What every agent of this package is as an algorithm of Stable-Baselines3: it learns in two phases, and nothing gets lost."""
 
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, cast
+import os
+from abc import abstractmethod
+from contextlib import ExitStack
+from typing import Any, TypeVar
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.dreamer_v2 import arguments
-from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, DreamerPolicy
+from sb3_dreamer_urlb.algorithm import checks, training_loop
+from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.envs import env_steps
-from sb3_dreamer_urlb.envs.faults import check_finite_action
-from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError, check_finite_action
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward
+from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
+from sb3_dreamer_urlb.runs.last_state import save_last_good_state
+from sb3_dreamer_urlb.runs.resuming import resume_if_asked
+from sb3_dreamer_urlb.spaces.actions import make_actions
+from sb3_dreamer_urlb.types import MetricMeans
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
 
-class ActingAlgorithm(OffPolicyAlgorithm):
-    """The part of :class:`~sb3_dreamer_urlb.DreamerV2` between the agent and its environments."""
+class PhasedAlgorithm(SavingAlgorithm):
+    """An off-policy algorithm that pre-trains with an intrinsic reward and fine-tunes on a task (paper §2, §3).
 
-    policy: DreamerPolicy
-    replay_buffer: SequenceReplayBuffer
-    phase: str
-    #: agent steps and environment frames in the phase
-    phase_timesteps: int
-    phase_frames: int
-    #: environment frames an agent step
-    action_repeat: int
-    #: of the environment's task, None where it does not tell
-    domain: str | None
-    #: faults that environments' guards reported so far
-    env_faults: int
-    planner: str | None
-    planner_delay: int
-    discount_head: bool | None
-    skill_size: int
-    _acting_state: ActingState | None
+    The base of :class:`~sb3_dreamer_urlb.DreamerV2`, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
+    does not depend on how an agent learns: phases and their counters, what the environment tells, ``learn``, faults, files.
+    A subclass says, in the order in which they happen:
 
-    def predict(
+    - :meth:`_prepare`: what follows from the arguments before anything is built;
+    - :meth:`_new_replay_buffer`, :meth:`_new_policy`, :meth:`_build`: the parts of the current phase;
+    - ``_sample_action``, SB3's: how it acts while it learns; :meth:`_replayed_beside` what the replay keeps of that;
+    - ``train``, SB3's: the updates;
+    - :meth:`_transfer`: what a fine-tuning agent takes over.
+
+    :param policy: name or class
+    :param env: environment, vectorised or not, or its id
+    :param learning_rate: a number or a schedule
+    :param intrinsic_reward: what the pre-training explores with; None to learn the task at once
+    :param verbose: 0 quiet, 1 info, 2 debug
+    :param overlap: let environments in other processes step while an update runs
+    :param preset: name of the set of hyperparameters that filled in what the caller left out
+    :param kwargs: of SB3's ``OffPolicyAlgorithm``
+    """
+
+    def __init__(
         self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """See :meth:`DreamerPolicy.predict`; plans if a planner is set and its time has come."""
-        self.policy.planning = self._planner_is_on()
-        return self.policy.predict(observation, state, episode_start, deterministic)
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule,
+        *,
+        intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None,
+        verbose: int,
+        overlap: bool,
+        preset: str,
+        **kwargs: Any,
+    ):
+        checks.check_verbose(verbose)
+        super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
+        self.intrinsic_reward = intrinsic_reward
+        self.overlap = overlap
+        self.preset = preset
+        #: name of the phase; with its own counters, which ``learn`` never resets
+        self.phase = phases.FINETUNING if intrinsic_reward is None else phases.PRETRAINING
+        self.phase_timesteps = 0
+        self.phase_updates = 0
+        #: environment frames seen in the phase: agent steps × action repeat
+        self.phase_frames = 0
+        #: environment frames of the pre-training that this model was fine-tuned from
+        self.pretrained_frames = 0
+        #: skipped updates of what this model was before, in the other phase or in a file
+        self._skipped_before = 0
+        #: environment frames an agent step
+        self.action_repeat = 1
+        #: of the environment's task, None where it does not tell
+        self.domain = None
+        #: faults that environments' guards reported so far
+        self.env_faults = 0
+        self.run_folder = None
+        self.checkpoint = None
+        self.during_learn = ExitStack()
+        #: of the updates since the last line of the log
+        self._metrics = MetricMeans()
+        self._logged_phase: str | None = None
 
-    def _planner_is_on(self) -> bool:
-        due = self.phase_timesteps >= self.learning_starts + self.planner_delay
-        return self.planner is not None and phases.PHASES[self.phase].plans and due and self.policy.agent.trains_behavior()
+    # -- set-up --------------------------------------------------------------------------------------------------------
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """One step of the recurrent agent; what it remembers is the action *as executed*."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        state = self._acting_state or self.policy.initial_state(n_envs)
-        self.policy.planning = self._planner_is_on()
-        with th.no_grad():
-            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
-            if phases.PHASES[self.phase].random_warmup and self.phase_timesteps < learning_starts:
-                uniform = np.stack([self.action_space.sample() for _ in range(n_envs)])
-                scaled = self.policy.actions.from_env(uniform)
-            else:
-                state = self.policy.choose(state, deterministic=False)
-                scaled = state.action.cpu().numpy()
-        if action_noise is not None:
-            scaled = np.clip(scaled + action_noise().reshape(n_envs, -1), -1, 1)
-        check_finite_action(scaled, "The policy", self.num_timesteps)
-        scaled = scaled.astype(np.float32)
-        state.action = th.as_tensor(scaled, device=self.device)
-        self._acting_state = state
-        self.phase_timesteps += n_envs
-        self.phase_frames += n_envs * self.action_repeat
-        return self.policy.to_env_action(scaled), scaled
+    def _setup_model(self) -> None:
+        self._prepare()
+        self.set_random_seed(self.seed)
+        self._build()
 
-    def forget_step(self) -> None:
-        """The step whose actions were chosen last came to no end: it does not count, and who goes on needs a reset.
+    def _prepare(self) -> None:
+        # Paths as snapshots can hold them.
+        path = self.replay_buffer_kwargs.get("path")
+        if isinstance(path, os.PathLike):
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
+        if isinstance(self.tensorboard_log, os.PathLike):
+            self.tensorboard_log = os.fspath(self.tensorboard_log)
+        self._setup_lr_schedule()
+        self._convert_train_freq()
+        self._read_env()
 
-        Some of the environments may have made it, and nobody knows what came of it.
-        """
-        self.phase_timesteps -= self.n_envs
-        self.phase_frames -= self.n_envs * self.action_repeat
-        self._last_obs = None
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}.")
+        return self.policy_aliases[policy_name]
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """As SB3's: the replay holds what the environment gave; and the recurrent state needs to know where episodes begin."""
-        normalizer = self._vec_normalize_env
-        if normalizer is None:
-            self._last_original_obs, original_obs = self._last_obs, new_obs
-        else:
-            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
-        self.env_faults += env_steps.count_faults(infos)
-        # The VecEnv has already begun the next episode: put the true last observation back.
-        next_obs = copy.deepcopy(original_obs)
-        for i in np.flatnonzero(dones):
-            if (last := infos[i].get("terminal_observation")) is not None:
-                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
-        env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        assert self._acting_state is not None
-        skill = {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
-        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **skill)  # type: ignore[arg-type]
-        self._last_obs, self._last_original_obs = new_obs, original_obs
-        self._last_episode_starts = dones.astype(bool)
+    @property
+    def skipped_updates(self) -> int:
+        """Updates so far, in both phases, that were skipped because a loss or gradient was not finite."""
+        guard = self._guard()
+        return self._skipped_before + (0 if guard is None else guard.total())
 
-    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
-        """The last observation before normalisation, with channels first as the model sees it."""
-        original = normalizer.get_original_obs()
-        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
+    @skipped_updates.setter
+    def skipped_updates(self, count: int) -> None:
+        # As of a file, before anything is built.
+        self._skipped_before = count
+
+    @abstractmethod
+    def _guard(self) -> UpdateGuard | None:
+        """What counts the present optimisers' skipped updates; None before there are any."""
 
     # -- environments --------------------------------------------------------------------------------------------------
-
-    def restart_episodes(self) -> None:
-        """Reset all environments in the middle of ``learn``, because they changed."""
-        assert self.env is not None
-        self.replay_buffer.close_streams()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)
-        self._last_episode_starts = np.ones(self.env.num_envs, bool)
 
     def prepare_env(self, env: GymEnv) -> VecEnv:
         """Wrap an environment as SB3 does, and check that this model can go on in it.
@@ -146,11 +142,14 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         :raises ValueError: if it does not fit
         """
         wrapped = self._wrap_env(env, self.verbose)
-        arguments.check_env(cast("DreamerV2", self), wrapped)
+        self._check_env(wrapped)
         return wrapped
 
+    def _check_env(self, env: VecEnv) -> None:
+        checks.check_env(self, env)
+
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """As SB3's; also checks that episodes are long enough, and reads the new environment's action repeat.
+        """As SB3's; also checks what else the model needs of it, and reads the new environment's action repeat.
 
         :param env: with the model's number of environments and its spaces
         :param force_reset: reset it before going on
@@ -163,10 +162,209 @@ class ActingAlgorithm(OffPolicyAlgorithm):
         """What the environment tells about itself beyond its spaces."""
         if self.env is None:
             return
-        self.action_repeat = int(arguments.env_attribute(self.env, "action_repeat", 1))
-        self.domain = arguments.env_attribute(self.env, "domain", None)
-        if self.discount_head is None:
-            self.discount_head = not arguments.env_attribute(self.env, "never_terminates", False)
+        self.action_repeat = int(env_attribute(self.env, "action_repeat", 1))
+        self.domain = env_attribute(self.env, "domain", None)
+
+    def restart_episodes(self) -> None:
+        """Reset all environments in the middle of ``learn``, because they changed."""
+        assert self.env is not None
+        self.replay_buffer.close_streams()
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
+        self._last_episode_starts = np.ones(self.env.num_envs, bool)
+
+    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
+        """The last observation before normalisation, with channels first as the model sees it."""
+        original = normalizer.get_original_obs()
+        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
+
+    # -- phases --------------------------------------------------------------------------------------------------------
+
+    def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
+        """Leave pre-training: what the transfer keeps stays, everything else starts afresh (paper §3).
+
+        The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
+
+        :param env: the fine-tuning environment; None stays in the same one
+        :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
+        :param keep_critic: for ablations
+        :raises ValueError: if the model is not pre-training
+        """
+        if self.phase != phases.PRETRAINING:
+            raise ValueError(f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}.")
+        if env is not None:
+            self.set_env(env)
+        if keep_actor is None:
+            keep_actor = phases.keeps_actor(self.domain)
+        pretrained = self.policy
+        self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
+        self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
+        self.replay_buffer.close()
+        del self.replay_buffer
+        self._build()
+        self._transfer(pretrained, keep_actor, keep_critic)
+        self._last_obs = None
+
+    @abstractmethod
+    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:
+        """Take over from the pre-trained policy what fine-tuning keeps; the model's own is fresh.
+
+        :param pretrained: of the same sizes
+        :param keep_actor: whether the actor is kept
+        :param keep_critic: whether the critic is kept
+        """
+
+    # -- collecting ----------------------------------------------------------------------------------------------------
+
+    def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
+        """Uniformly random actions while this phase's warm-up lasts, float32 (n, A) as the agent chooses them; then None.
+
+        :param learning_starts: agent steps of the warm-up
+        :param n_envs: n
+        """
+        if not phases.PHASES[self.phase].random_warmup or self.phase_timesteps >= learning_starts:
+            return None
+        return make_actions(self.action_space).from_env(np.stack([self.action_space.sample() for _ in range(n_envs)]))
+
+    def _as_executed(self, actions: np.ndarray, action_noise: ActionNoise | None) -> np.ndarray:
+        """The actions that environments will get, float32 (n, A) in [-1, 1], or one-hot; counts their step.
+
+        :param actions: as chosen
+        :param action_noise: added to them
+        :raises ValueError: if one is not finite
+        """
+        n = len(actions)
+        if action_noise is not None:
+            actions = np.clip(actions + action_noise().reshape(n, -1), -1, 1)
+        check_finite_action(actions, "The policy", self.num_timesteps)
+        self.phase_timesteps += n
+        self.phase_frames += n * self.action_repeat
+        return actions.astype(np.float32)
+
+    def forget_step(self) -> None:
+        """The step whose actions were chosen last came to no end: it does not count, and who goes on needs a reset.
+
+        Some of the environments may have made it, and nobody knows what came of it.
+        """
+        self.phase_timesteps -= self.n_envs
+        self.phase_frames -= self.n_envs * self.action_repeat
+        self._last_obs = None
+
+    def _replayed_beside(self) -> dict[str, np.ndarray]:
+        """Further columns of the replay's rows, of the step that was just made, by name: (n, …)."""
+        return {}
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """As SB3's: the replay holds what the environment gave; and a recurrent agent needs to know where episodes begin."""
+        normalizer = self._vec_normalize_env
+        if normalizer is None:
+            self._last_original_obs, original_obs = self._last_obs, new_obs
+        else:
+            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
+        self.env_faults += env_steps.count_faults(infos)
+        # The VecEnv has already begun the next episode: put the true last observation back.
+        next_obs = copy.deepcopy(original_obs)
+        for i in np.flatnonzero(dones):
+            if (last := infos[i].get("terminal_observation")) is not None:
+                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
+        env_steps.check_finite(next_obs, reward, self.num_timesteps)
+        beside = self._replayed_beside()
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
+        self._last_obs, self._last_original_obs = new_obs, original_obs
+        self._last_episode_starts = dones.astype(bool)
+
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfPhasedAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPhasedAlgorithm:
+        """Collect and learn for ``total_timesteps`` agent steps; as SB3's, but warm-ups count by phase, not by call.
+
+        :param total_timesteps: agent steps; where a ``RunCheckpointCallback(..., resume="auto")`` goes on with a run, of the
+            whole run
+        :param callback: SB3 callback(s)
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the TensorBoard run
+        :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
+        :param progress_bar: show one
+        :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
+        :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
+        """
+        with self.during_learn:
+            if resume_if_asked(self, callback):
+                total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False
+            total_timesteps, callbacks = self._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            )
+            callbacks.on_training_start(locals(), globals())
+            try:
+                training_loop.learn(
+                    self, total_timesteps, callbacks, log_interval, self._update, self.overlap, self.forget_step
+                )
+            except (EnvironmentFaultError, NumericalFaultError) as error:
+                raise type(error)(f"{error} {save_last_good_state(self)}") from error
+            callbacks.on_training_end()
+            return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            # The environments are about to be reset.
+            self.replay_buffer.close_streams()
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if self.run_folder is not None:
+            self.run_folder.restore_normalization(self.get_vec_normalize_env(), self.restart_episodes)
+        self._logged_phase = None
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
+        return result
+
+    def _update(self, collected: int, ahead: int) -> None:
+        """The updates after, or within the last step of, one rollout.
+
+        :param collected: agent steps of the rollout
+        :param ahead: agent steps that are under way, and not yet counted in ``num_timesteps``
+        """
+        # SB3 gates on num_timesteps, which every learn() resets.
+        if self.phase_timesteps <= self.learning_starts:
+            return
+        self._update_current_progress_remaining(self.num_timesteps + ahead, self._total_timesteps)
+        self.train(self.gradient_steps if self.gradient_steps >= 0 else collected, self.batch_size)
+        self.policy.set_training_mode(False)
+
+    def dump_logs(self) -> None:
+        """Write the log; the only place where metrics leave the device."""
+        for name, value in self._metrics.take().items():
+            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/skipped_updates", self.skipped_updates)
+        self.logger.record("rollout/env_faults", self.env_faults)
+        # TensorBoard shows texts one by one: once a phase will do.
+        self.logger.record("time/phase", self.phase, exclude="tensorboard" if self.phase == self._logged_phase else None)
+        self._logged_phase = self.phase
+        self.logger.record("time/phase_frames", self.phase_frames)
+        self.logger.record("time/total_frames", self.num_timesteps * self.action_repeat)
+        super().dump_logs()
 
 
 def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:

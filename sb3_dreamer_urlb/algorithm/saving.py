@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 import os
+from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_dreamer_urlb.dreamer_v2 import arguments
-from sb3_dreamer_urlb.learning.learner import Learner
+from sb3_dreamer_urlb.algorithm.checks import check_load_keywords
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.runs import run_folder
+from sb3_dreamer_urlb.runs.contract import RunningAlgorithm
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
-
 SelfSavingAlgorithm = TypeVar("SelfSavingAlgorithm", bound="SavingAlgorithm")
 
 
-class SavingAlgorithm(OffPolicyAlgorithm):
-    """The part of :class:`~sb3_dreamer_urlb.DreamerV2` that saves and loads."""
+class SavingAlgorithm(RunningAlgorithm):
+    """Stable-Baselines3's ``save``, ``load`` and their kin, with files that can never run code."""
 
-    learner: Learner
-    replay_buffer: SequenceReplayBuffer
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        optimizers = [f"learner.{name}.adam" for name in self.learner.optimizers()]
-        return ["policy", *optimizers], []
+    @abstractmethod
+    def _new_replay_buffer(self) -> SequenceReplayBuffer:
+        """An empty one for the current phase."""
 
     def save(self, path: Target, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
         """Write the model, without replay and environment, in a form that can never run code.
@@ -45,7 +39,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         """
         if exclude or include:
             raise ValueError("A snapshot is always whole: save() takes neither exclude nor include.")
-        model_snapshot.save(_whole(self), path)
+        model_snapshot.save(self, path)
 
     @classmethod
     def load(
@@ -73,11 +67,8 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         :raises TypeError: for a keyword that is no constructor argument
         :raises SnapshotError: naming the file and why it is refused
         """
-        whole: Any = cls
-        arguments.check_load_keywords(whole, kwargs)
-        model: SelfSavingAlgorithm
-        model = model_snapshot.load(whole, path, env, device, custom_objects, print_system_info, kwargs)[0]
-        return model
+        check_load_keywords(cls, kwargs)
+        return model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
 
     @classmethod
     def resume(
@@ -101,11 +92,15 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         :raises SnapshotError: naming the file and why it is refused
         :raises RuntimeError: if the run is still going
         """
-        whole: Any = cls
-        arguments.check_load_keywords(whole, kwargs)
-        return run_folder.resume(
-            whole, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
+        check_load_keywords(cls, kwargs)
+        resumed = run_folder.resume(
+            cls, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
         )
+        if resumed is None:
+            return None
+        model, folder_of_it = resumed
+        model.run_folder = folder_of_it
+        return model
 
     def set_parameters(
         self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
@@ -120,7 +115,7 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         if isinstance(load_path_or_dict, dict):
             super().set_parameters(load_path_or_dict, exact_match, device)
         else:
-            model_snapshot.set_parameters(_whole(self), load_path_or_dict, exact_match)
+            model_snapshot.set_parameters(self, load_path_or_dict, exact_match)
 
     def save_replay_buffer(self, path: Target) -> None:
         """Write the replay, open episodes included, in a form that can never run code.
@@ -137,11 +132,6 @@ class SavingAlgorithm(OffPolicyAlgorithm):
         :raises SnapshotError: if the file is damaged, does not fit the model, or was filled in another phase; the model
             keeps its own then
         """
-        buffer = _whole(self)._new_replay_buffer()
+        buffer = self._new_replay_buffer()
         replay_snapshot.load(buffer, path)
         self.replay_buffer = buffer
-
-
-def _whole(part: SavingAlgorithm) -> DreamerV2:
-    """The algorithm that this is a part of; said to the type checker alone."""
-    return cast("DreamerV2", part)

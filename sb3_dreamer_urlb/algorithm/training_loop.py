@@ -11,16 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 
 class LearningVecEnv(VecEnvWrapper):
@@ -81,27 +78,34 @@ class LearningVecEnv(VecEnvWrapper):
         return self.venv.step_wait()
 
 
-def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_interval: int) -> None:
+def learn(
+    model: OffPolicyAlgorithm,
+    total_timesteps: int,
+    callbacks: BaseCallback,
+    log_interval: int,
+    update: Callable[[int, int], None],
+    overlap: bool,
+    lost: Callable[[], None],
+) -> None:
     """Collect and update until the steps are done, or a callback ends it.
 
     :param model: set up by SB3's ``_setup_learn``
     :param total_timesteps: value of ``num_timesteps`` to reach
     :param callbacks: told as SB3 tells them
     :param log_interval: episodes between two log lines
+    :param update: the updates of one rollout; told its agent steps, and how many of them are still under way
+    :param overlap: let the environments step meanwhile
+    :param lost: told of a step that did not come to its end
     """
-    assert isinstance(model.train_freq, TrainFreq)
+    assert isinstance(model.train_freq, TrainFreq) and model.replay_buffer is not None
     frequency, unit = model.train_freq
     steps = frequency if unit == TrainFrequencyUnit.STEP else None
     env: LearningVecEnv | None = None
-
-    def update() -> None:
-        _update(model, frequency * model.n_envs, ahead=model.n_envs)
-
     while model.num_timesteps < total_timesteps:
         assert model.env is not None
         if env is None or env.venv is not model.env:
             # At first, and when a callback brought other environments.
-            env = LearningVecEnv(model.env, update, model.overlap, model.forget_step)
+            env = LearningVecEnv(model.env, lambda: update(frequency * model.n_envs, model.n_envs), overlap, lost)
         rollout = model.collect_rollouts(
             env.begin(steps),
             callbacks,
@@ -115,18 +119,4 @@ def learn(model: DreamerV2, total_timesteps: int, callbacks: BaseCallback, log_i
             break
         if steps is None:
             # Which step is an episode's last is known afterwards.
-            _update(model, rollout.episode_timesteps)
-
-
-def _update(model: DreamerV2, collected: int, ahead: int = 0) -> None:
-    """The updates after, or within the last step of, one rollout.
-
-    :param collected: agent steps of the rollout
-    :param ahead: agent steps that are under way, and not yet counted in ``num_timesteps``
-    """
-    # SB3 gates on num_timesteps, which every learn() resets.
-    if model.phase_timesteps <= model.learning_starts:
-        return
-    model._update_current_progress_remaining(model.num_timesteps + ahead, model._total_timesteps)
-    model.train(model.gradient_steps if model.gradient_steps >= 0 else collected, model.batch_size)
-    model.policy.set_training_mode(False)
+            update(rollout.episode_timesteps, 0)

@@ -8,21 +8,17 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 
-from sb3_dreamer_urlb.evaluation import history
-from sb3_dreamer_urlb.runs import run_folder
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.runs import evaluation_history
+from sb3_dreamer_urlb.runs.resuming import ResumingCallback
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
-from sb3_dreamer_urlb.snapshots.model_data import argument, describe_arguments
-from sb3_dreamer_urlb.snapshots.values import contains_custom, decode
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 
-class RunCheckpointCallback(BaseCallback):
+class RunCheckpointCallback(ResumingCallback):
     """Keep a run in a folder, so that it can go on after whatever killed it.
 
     With ``resume="auto"`` the same script, started again, does so: when ``learn`` begins and the folder holds a checkpoint,
@@ -67,7 +63,7 @@ class RunCheckpointCallback(BaseCallback):
         self._saved: tuple[Any, ...] | None = None
 
     def _init_callback(self) -> None:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         run = model.run_folder
         if run is None or run.path.resolve() != self.folder.resolve():
             run = RunFolder(self.folder)
@@ -75,7 +71,7 @@ class RunCheckpointCallback(BaseCallback):
         if not run.is_current():
             raise ValueError(
                 f"{self.folder} holds another run. To go on with it: RunCheckpointCallback(..., resume='auto') with a new "
-                f"model, or DreamerV2.resume({str(self.folder)!r}, env); for a new run choose another folder."
+                f"model, or {type(model).__name__}.resume({str(self.folder)!r}, env); for a new run choose another folder."
             )
         model.run_folder = self.run = run
         run.begun = True
@@ -84,7 +80,7 @@ class RunCheckpointCallback(BaseCallback):
         self._saved = None if run.identity is None else self._state()
         self.received = None
         if self.evaluation is not None and run.evaluation is not None:
-            history.restore(self.evaluation, run.evaluation)
+            evaluation_history.restore(self.evaluation, run.evaluation)
             run.evaluation = None
         if self.handle_signals and threading.current_thread() is threading.main_thread():
             model.during_learn.enter_context(self._watching())
@@ -105,7 +101,7 @@ class RunCheckpointCallback(BaseCallback):
         self.received = number
 
     def _state(self) -> tuple[Any, ...]:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         return model.phase, model.phase_frames, model._n_updates
 
     def _on_rollout_start(self) -> None:
@@ -117,7 +113,7 @@ class RunCheckpointCallback(BaseCallback):
         return self.received is None
 
     def _on_training_end(self) -> None:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         # rl_zoo3 calls this once more when the folder is not ours any longer.
         if model.checkpoint is None:
             return
@@ -134,64 +130,7 @@ class RunCheckpointCallback(BaseCallback):
         return self.folder
 
     def _save(self) -> None:
-        self.run.save(self.model, history.state(self.evaluation))  # type: ignore[arg-type]
+        self.run.save(self.model, evaluation_history.state(self.evaluation))  # type: ignore[arg-type]
         self._saved = self._state()
         if self.verbose >= 1:
             print(f"Checkpoint {self.run.number} in {self.folder}: {self._saved[0]}, {self._saved[1]} frames")
-
-
-def resume_if_asked(model: DreamerV2, callback: Any) -> bool:
-    """Go on with a run where a :class:`RunCheckpointCallback` says ``resume="auto"``; before ``learn`` does anything.
-
-    :param model: about to learn; becomes the checkpoint's
-    :param callback: what ``learn`` was given
-    :return: whether a run goes on
-    :raises ValueError: if it is one of other arguments
-    :raises SnapshotError: naming the file and why it is refused
-    """
-    callbacks = _flat(callback)
-    asked = [one for one in callbacks if isinstance(one, RunCheckpointCallback) and one.resume == "auto"]
-    if not asked or not _go_on(model, asked[0].folder):
-        return False
-    if asked[0].verbose >= 1:
-        print(f"Going on with the run in {asked[0].folder} after {model.num_timesteps} steps.")
-    for one in callbacks:
-        # What is due every so many steps stays so.
-        one.n_calls = one.n_calls or model.num_timesteps // model.n_envs
-    return True
-
-
-def _flat(callback: Any) -> list[BaseCallback]:
-    if isinstance(callback, list | tuple):
-        return [one for inner in callback for one in _flat(inner)]
-    if isinstance(callback, CallbackList):
-        return _flat(callback.callbacks)
-    return [callback] if isinstance(callback, BaseCallback) else []
-
-
-def _go_on(model: DreamerV2, folder: Path) -> bool:
-    mine = model.run_folder
-    if mine is not None and mine.path.resolve() == folder.resolve():
-        # DreamerV2.resume has been here; and from the second learn() on, steps count as ever.
-        return mine.resumed and not mine.begun
-    if model.phase_timesteps > 0:
-        return False  # it has a life of its own
-    arguments = describe_arguments(model)
-    given = {name: argument(model, name) for name, value in arguments.items() if contains_custom(decode(value)) is not None}
-    own = {"verbose": model.verbose, "tensorboard_log": model.tensorboard_log}
-    options = {"device": model.device, "print_system_info": False, "kwargs": own}
-    found = run_folder.resume(type(model), folder, model.get_env(), custom_objects=given, **options)
-    if found is None:
-        return False
-    for name, value in describe_arguments(found).items():
-        if value != arguments[name]:
-            raise ValueError(
-                f"The run in {folder} has {name}={argument(found, name)!r}, the model {argument(model, name)!r}: with "
-                "resume='auto' a run keeps its arguments. DreamerV2.resume(folder, env, ...) takes others."
-            )
-    # Everything is the run's, but for what belongs to this call of learn.
-    state: dict[str, Any] = dict(vars(found))
-    state |= {name: value for name, value in vars(model).items() if name in ("during_learn", "_logger", "_custom_logger")}
-    vars(model).clear()
-    vars(model).update(state)
-    return True

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 
 class PhaseSwitchCallback(BaseCallback):
@@ -48,7 +45,7 @@ class PhaseSwitchCallback(BaseCallback):
         self.keep_critic = keep_critic
 
     def _init_callback(self) -> None:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         if model.intrinsic_reward is None and model.phase != PRETRAINING:
             warnings.warn(
                 "PhaseSwitchCallback has nothing to switch: with intrinsic_reward=None the model learns the task at once."
@@ -77,7 +74,7 @@ class PhaseSwitchCallback(BaseCallback):
             self._switch_if_due()
 
     def _switch_if_due(self) -> None:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         if model.phase != PRETRAINING or model.phase_frames < self.pretrain_frames:
             return
         if self.verbose >= 1:
@@ -106,7 +103,7 @@ class FineTuneCallback(BaseCallback):
         return True
 
     def _on_training_start(self) -> None:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         if model.phase_timesteps == 0 and (model.phase == PRETRAINING or model.intrinsic_reward is None):
             raise ValueError(
                 "FineTuneCallback needs a pre-trained model, this one has seen 0 frames: "

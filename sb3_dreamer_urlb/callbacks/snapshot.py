@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 #: when the paper saves its pre-trained agents, in environment frames
 SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
@@ -47,11 +44,11 @@ class SnapshotCallback(BaseCallback):
 
     def _init_callback(self) -> None:
         os.makedirs(self.save_path, exist_ok=True)
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         self.pending = [frame for frame in self.frames if frame > model.phase_frames]
 
     def _on_step(self) -> bool:
-        model: DreamerV2 = self.model  # type: ignore[assignment]
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         if model.phase != PRETRAINING:
             return True
         while self.pending and model.phase_frames >= self.pending[0]:

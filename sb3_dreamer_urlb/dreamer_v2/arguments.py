@@ -1,29 +1,27 @@
-"""Checks of what users hand in: one clear error, before any time is spent."""
+"""Checks of DreamerV2's arguments: one clear error, before any time is spent."""
 
 from __future__ import annotations
 
 import inspect
 import math
-import os
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any
 
-from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
+from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
-from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.spaces.actions import make_actions
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 # smallest allowed value of each integer argument
 INTEGERS = {
@@ -36,8 +34,8 @@ INTEGERS = {
     "skill_selection_starts": 0,
     "target_update_interval": 1,
 }
-# open or closed ranges of each number: (low, low allowed, high, high allowed)
-NUMBERS = {
+# open or closed ranges of each number
+NUMBERS: dict[str, checks.Range] = {
     "gamma": (0.0, False, 1.0, True),
     "gae_lambda": (0.0, True, 1.0, True),
     "kl_balance": (0.0, True, 1.0, True),
@@ -66,84 +64,58 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
 SHORT_EPISODES = 50
 
 
-def check(model: DreamerV2) -> None:
+def check(model: SavedAlgorithm) -> None:
     """Everything that can be known to be wrong before the networks are built.
 
+    :param model: with its arguments and, if it has an environment, with its spaces
     :raises ValueError: naming the argument, its value and what was expected
     """
-    _check_settings(model)
+    given = SimpleNamespace(**model.arguments())
+    checks.check_settings(model)
+    check_dict("planner_kwargs", given.planner_kwargs)
     for name, least in INTEGERS.items():
-        check_integer(name, getattr(model, name), least)
-    for name, (low, low_ok, high, high_ok) in NUMBERS.items():
-        value = getattr(model, name)
-        inside = is_number(value) and (low < value < high or (low_ok and value == low) or (high_ok and value == high))
-        if not inside:
-            bounds = f"{'[' if low_ok else '('}{low:g}, {high:g}{']' if high_ok else ')'}"
-            raise ValueError(f"{name} must lie in {bounds}, got {value!r}.")
-    frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
-    if not is_integer(frequency) or frequency < 1:
-        raise ValueError(f"train_freq must be a positive integer, or such a one with its unit, got {model.train_freq!r}.")
-    if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
-        raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
-    if model.ent_coef is not None and not (is_finite_number(model.ent_coef) and model.ent_coef >= 0):
-        raise ValueError(f"ent_coef must be a non-negative number or None, got {model.ent_coef!r}.")
-    if model.batch_length > model.buffer_size:
-        raise ValueError(f"batch_length={model.batch_length} must not exceed buffer_size={model.buffer_size}.")
+        check_integer(name, getattr(given, name), least)
+    for name, bounds in NUMBERS.items():
+        checks.check_number(name, getattr(given, name), bounds)
+    checks.check_schedule_of_updates(model)
+    if given.ent_coef is not None and not (is_finite_number(given.ent_coef) and given.ent_coef >= 0):
+        raise ValueError(f"ent_coef must be a non-negative number or None, got {given.ent_coef!r}.")
+    if given.batch_length > given.buffer_size:
+        raise ValueError(f"batch_length={given.batch_length} must not exceed buffer_size={given.buffer_size}.")
     for name in ("learning_rate", "actor_learning_rate", "critic_learning_rate"):
-        value = getattr(model, name)
+        value = getattr(given, name)
         if not callable(value) and not (is_finite_number(value) and value >= 0):
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
-    if model.discount_head is not None and not isinstance(model.discount_head, bool):
-        raise ValueError(f"discount_head must be True, False or None, got {model.discount_head!r}.")
-    if not isinstance(model.overlap, bool):
-        raise ValueError(f"overlap must be True or False, got {model.overlap!r}.")
-    if model.action_noise is not None and not isinstance(model.action_noise, ActionNoise):
-        raise ValueError(f"action_noise must be an ActionNoise of Stable-Baselines3 or None, got {model.action_noise!r}.")
-    _check_names(model)
+    if given.discount_head is not None and not isinstance(given.discount_head, bool):
+        raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
+    if not isinstance(given.overlap, bool):
+        raise ValueError(f"overlap must be True or False, got {given.overlap!r}.")
+    checks.check_noise(model)
+    _check_names(given, model.phase)
     _check_policy_kwargs(model)
-    _check_spaces(model)
+    _check_spaces(given, model)
     if model.env is not None:
-        _check_episode_fits(model, model.env)
+        check_episodes_fit(given.batch_length, model.replay_buffer_kwargs, model.env)
 
 
-def _check_settings(model: DreamerV2) -> None:
-    """What is not the algorithm's, but Stable-Baselines3's: it takes anything, and fails later."""
-    check_integer("stats_window_size", model._stats_window_size, 1)
-    if model.seed is not None and not (is_integer(model.seed) and 0 <= model.seed < 2**32):
-        raise ValueError(f"seed must be an integer in [0, 2**32), or None, got {model.seed!r}.")
-    if model.tensorboard_log is not None and not isinstance(model.tensorboard_log, str | os.PathLike):
-        raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
-    for name in ("policy_kwargs", "replay_buffer_kwargs", "planner_kwargs"):
-        check_dict(name, getattr(model, name))
-
-
-def check_verbose(verbose: Any) -> None:
-    """Before Stable-Baselines3 compares it with numbers.
-
-    :raises ValueError: for anything but 0, 1 and 2
-    """
-    if not is_integer(verbose) or not 0 <= verbose <= 2:
-        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
-
-
-def _check_names(model: DreamerV2) -> None:
-    if model.precision not in PRECISIONS:
-        raise ValueError(f"precision must be one of {PRECISIONS}, got {model.precision!r}.")
-    if model.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
-        raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {model.actor_gradient!r}.")
-    if model.compile not in COMPILE:
-        raise ValueError(f"compile must be one of {COMPILE}, got {model.compile!r}.")
-    method = model.intrinsic_reward
-    intrinsic = make_intrinsic_reward(method, model.intrinsic_kwargs)
+def _check_names(given: SimpleNamespace, phase: str) -> None:
+    if given.precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {PRECISIONS}, got {given.precision!r}.")
+    if given.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
+        raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {given.actor_gradient!r}.")
+    if given.compile not in COMPILE:
+        raise ValueError(f"compile must be one of {COMPILE}, got {given.compile!r}.")
+    method = given.intrinsic_reward
+    intrinsic = make_intrinsic_reward(method, given.intrinsic_kwargs)
     if intrinsic is not None:
-        intrinsic.check(particles=(model.imagination_horizon + 1) * model.batch_size * model.batch_length)
-    if method is None and PHASES[model.phase].explores:
+        intrinsic.check(particles=(given.imagination_horizon + 1) * given.batch_size * given.batch_length)
+    if method is None and PHASES[phase].explores:
         raise ValueError(
-            f"A model in the phase {model.phase!r} needs an intrinsic_reward, got None: to move on to the task, "
+            f"A model in the phase {phase!r} needs an intrinsic_reward, got None: to move on to the task, "
             "load it as it is and call fine_tune()."
         )
-    make_planner(model.planner, model.planner_kwargs, model.gae_lambda)
-    buffer_class = model.replay_buffer_class
+    make_planner(given.planner, given.planner_kwargs, given.gae_lambda)
+    buffer_class = given.replay_buffer_class
     if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):
         raise ValueError(
             f"replay_buffer_class must be a subclass of SequenceReplayBuffer, got {buffer_class!r}: "
@@ -151,49 +123,37 @@ def _check_names(model: DreamerV2) -> None:
         )
 
 
-def _check_policy_kwargs(model: DreamerV2) -> None:
+def _check_policy_kwargs(model: SavedAlgorithm) -> None:
     known = set(inspect.signature(model.policy_class.__init__).parameters) - POLICY_ARGUMENTS_OF_THE_MODEL
     unknown = sorted(set(model.policy_kwargs) - known)
     if unknown:
         raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")
 
 
-def _check_spaces(model: DreamerV2) -> None:
+def _check_spaces(given: SimpleNamespace, model: SavedAlgorithm) -> None:
     if getattr(model, "observation_space", None) is None:
         raise ValueError("DreamerV2 needs an environment: env is None.")
-    normalize_images = model.policy_kwargs.get("normalize_images", True)
-    model.policy_class.check_spaces(model.observation_space, model.action_space, normalize_images)
-    if model.actor_gradient == REINFORCE and not make_actions(model.action_space).classes:
+    kind: Any = model.policy_class
+    normalize_images = given.policy_kwargs.get("normalize_images", True)
+    kind.check_spaces(model.observation_space, model.action_space, normalize_images)
+    if given.actor_gradient == REINFORCE and not make_actions(model.action_space).classes:
         # The density of a clamped action is not the normal's.
         raise ValueError(f"actor_gradient='reinforce' needs Discrete or MultiDiscrete actions, got {model.action_space}.")
-    if model.action_noise is not None and make_actions(model.action_space).classes:
-        raise ValueError(f"action_noise={model.action_noise!r} needs a Box action space, got {model.action_space}.")
+    if given.action_noise is not None and make_actions(model.action_space).classes:
+        raise ValueError(f"action_noise={given.action_noise!r} needs a Box action space, got {model.action_space}.")
 
 
-def check_env(model: DreamerV2, env: VecEnv) -> None:
-    """Whether a model can go on in another environment.
+def check_episodes_fit(batch_length: int, replay_buffer_kwargs: dict[str, Any], env: VecEnv) -> None:
+    """Whether an environment's episodes are long enough for sequences, as far as it tells.
 
-    :param model: with its spaces
+    :param batch_length: T
+    :param replay_buffer_kwargs: how sequences are drawn
     :param env: vectorised
-    :raises AssertionError: for another number of environments, as SB3's ``set_env``
-    :raises ValueError: for other spaces, or episodes shorter than a sequence
+    :raises ValueError: if no episode can be
     """
-    if env.num_envs != model.n_envs:
-        raise AssertionError(
-            f"The number of environments differs from the model's: {env.num_envs} != {model.n_envs}. "
-            "To change it, load a snapshot with the new ones: DreamerV2.load(path, env=...)."
-        )
-    check_for_correct_spaces(env, model.observation_space, model.action_space)
-    _check_episode_fits(model, env)
-
-
-def _check_episode_fits(model: DreamerV2, env: VecEnv) -> None:
-    if model.replay_buffer_kwargs.get("sampling", BY_EPISODE) != BY_EPISODE:
+    if replay_buffer_kwargs.get("sampling", BY_EPISODE) != BY_EPISODE:
         return
-    batch_length = model.batch_length
-    steps = env_attribute(env, "max_episode_steps", None)
-    if steps is None:
-        steps = getattr(env_attribute(env, "spec", None), "max_episode_steps", None)
+    steps = steps_an_episode(env)
     # An episode has one row more than steps: the reset's.
     if steps is not None and steps + 1 < batch_length:
         raise ValueError(
@@ -212,20 +172,3 @@ def check_episode_length(buffer: SequenceReplayBuffer) -> None:
             f"(the longest had {buffer.longest} rows): choose a smaller batch_length, or "
             "replay_buffer_kwargs={'sampling': 'rows'}."
         )
-
-
-def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
-    """An attribute of the first environment, through all wrappers; ``default`` where there is none."""
-    # Asking a SubprocVecEnv for an attribute that is not there would end its processes.
-    return env.get_attr(name, indices=0)[0] if env.has_attr(name) else default
-
-
-def check_load_keywords(algorithm: type[DreamerV2], kwargs: dict[str, Any]) -> None:
-    """SB3 would silently set any keyword as an attribute.
-
-    :raises TypeError: for a keyword that is no constructor argument, or one that only makes sense there
-    """
-    known = set(inspect.signature(algorithm.__init__).parameters) - {"self", "policy", "env", "preset", "_init_setup_model"}
-    unknown = sorted(set(kwargs) - known)
-    if unknown:
-        raise TypeError(f"load() got unknown keywords {unknown}; known are {sorted(known)}.")

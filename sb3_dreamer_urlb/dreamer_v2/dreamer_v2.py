@@ -2,43 +2,36 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import native, phases
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
-from sb3_dreamer_urlb.callbacks import checkpoint as run_checkpoints
-from sb3_dreamer_urlb.dreamer_v2 import arguments, training_loop, transfer
-from sb3_dreamer_urlb.dreamer_v2.acting import ActingAlgorithm
+from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.dreamer_v2.presets import with_preset
-from sb3_dreamer_urlb.dreamer_v2.saving import SavingAlgorithm
-from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
+from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
-from sb3_dreamer_urlb.learning import graphs, numerical_faults
+from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-from sb3_dreamer_urlb.runs.last_state import save_last_good_state
-from sb3_dreamer_urlb.runs.run_folder import RunFolder
 from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
 
 
-class DreamerV2(ActingAlgorithm, SavingAlgorithm):
+class DreamerV2(PhasedAlgorithm):
     """DreamerV2 with unsupervised pre-training, task-aware fine-tuning and Dyna-MPC.
 
     "Mastering the Unsupervised Reinforcement Learning Benchmark from Pixels" (ICML 2023). With an ``intrinsic_reward``
@@ -114,6 +107,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy_class: type[DreamerPolicy]
+    policy: DreamerPolicy
 
     @with_preset
     def __init__(
@@ -163,17 +157,17 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         preset: str = "paper",
         _init_setup_model: bool = True,
     ):
-        arguments.check_verbose(verbose)
         super().__init__(
             policy,
             env,
             learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
             gamma=gamma,
             train_freq=train_freq,
             gradient_steps=gradient_steps,
+            intrinsic_reward=intrinsic_reward,
             action_noise=action_noise,
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
@@ -181,17 +175,16 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
-            device=device,
-            support_multi_env=True,
             seed=seed,
-            sde_support=False,
+            device=device,
+            overlap=overlap,
+            preset=preset,
         )
         self.actor_learning_rate = actor_learning_rate
         self.critic_learning_rate = critic_learning_rate
         self.batch_length = batch_length
         self.imagination_horizon = imagination_horizon
         self.gae_lambda = gae_lambda
-        self.intrinsic_reward = intrinsic_reward
         self.intrinsic_kwargs = intrinsic_kwargs
         self.skill_selection_starts = skill_selection_starts
         self.planner = planner
@@ -208,67 +201,36 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self.weight_decay = weight_decay
         self.discount_head = discount_head
         self.precision = precision
-        self.overlap = overlap
         self.compile = compile
-        self.preset = preset
-
-        #: name of the phase; with its own counters, which ``learn`` never resets
-        self.phase = phases.FINETUNING if intrinsic_reward is None else phases.PRETRAINING
-        self.phase_timesteps = 0
-        self.phase_updates = 0
-        #: environment frames seen in the phase: agent steps × action repeat
-        self.phase_frames = 0
-        #: environment frames of the pre-training that this model was fine-tuned from
-        self.pretrained_frames = 0
-        self._logged_phase: str | None = None
-        #: environment frames an agent step
-        self.action_repeat = 1
-        #: faults that environments' guards reported so far
-        self.env_faults = 0
-        self._skipped_before = 0
-        #: of the environment's task, None where it does not tell
-        self.domain: str | None = None
-        #: where the run is kept, None unless a RunCheckpointCallback does
-        self.run_folder: RunFolder | None = None
-        #: writes a checkpoint of the run now and returns its folder; None unless a RunCheckpointCallback is at work
-        self.checkpoint: Callable[[], Path] | None = None
-        #: what callbacks want undone when ``learn`` ends, however it ends
-        self.during_learn = ExitStack()
 
         if _init_setup_model:
             self._setup_model()
 
     # -- set-up --------------------------------------------------------------------------------------------------------
 
-    def _setup_model(self) -> None:
-        self._prepare()
-        self.set_random_seed(self.seed)
-        self._build()
-
     def _prepare(self) -> None:
-        """Everything of the set-up that builds nothing yet."""
         arguments.check(self)
-        # Paths as snapshots can hold them.
-        path = self.replay_buffer_kwargs.get("path")
-        if isinstance(path, os.PathLike):
-            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "path": os.fspath(path)}
-        if isinstance(self.tensorboard_log, os.PathLike):
-            self.tensorboard_log = os.fspath(self.tensorboard_log)
-        self._setup_lr_schedule()
+        super()._prepare()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
         graphs.warn_if_in_vain(self.compile, self.device)
-        self._convert_train_freq()
-        self._read_env()
+
+    def _read_env(self) -> None:
+        super()._read_env()
+        if self.env is not None and self.discount_head is None:
+            self.discount_head = not env_attribute(self.env, "never_terminates", False)
+
+    def _check_env(self, env: VecEnv) -> None:
+        super()._check_env(env)
+        arguments.check_episodes_fit(self.batch_length, self.replay_buffer_kwargs, env)
 
     def _build(self) -> None:
-        """Fresh networks, optimisers and replay for the current phase."""
         intrinsic = self._intrinsic()
         self.skill_size = 0 if intrinsic is None or intrinsic.skills is None else intrinsic.skills.dim
         if getattr(self, "replay_buffer", None) is None:
             self.replay_buffer = self._new_replay_buffer()
         self._skipped_before = self.skipped_updates
-        self.policy = self._new_policy(intrinsic).to(self.device)
+        self.policy = self._new_policy().to(self.device)
         self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
         self.learner.updates = self.phase_updates
         if self.verbose >= 1:
@@ -278,14 +240,14 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         self._acting_state: ActingState | None = None
         self._metrics = MetricMeans()
 
-    def _new_policy(self, intrinsic: IntrinsicReward | None) -> DreamerPolicy:
+    def _new_policy(self) -> DreamerPolicy:
         return self.policy_class(
             self.observation_space,
             self.action_space,
             self.lr_schedule,
             gamma=self.gamma,
             discount_head=bool(self.discount_head),
-            intrinsic=intrinsic,
+            intrinsic=self._intrinsic(),
             explores=phases.PHASES[self.phase].explores,
             planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
             precision=self.precision,
@@ -339,48 +301,62 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         )
         return buffer
 
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        if policy_name not in self.policy_aliases:
-            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}.")
-        return self.policy_aliases[policy_name]
+    def adams(self) -> dict[str, th.optim.Adam]:
+        """Those of the learner, by their names in snapshots."""
+        return {name: optimizer.adam for name, optimizer in self.learner.optimizers().items()}
 
-    @property
-    def skipped_updates(self) -> int:
-        """Updates so far, in both phases, that were skipped because a loss or gradient was not finite."""
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *(f"learner.{name}.adam" for name in self.learner.optimizers())], []
+
+    def _guard(self) -> UpdateGuard | None:
         learner: Learner | None = getattr(self, "learner", None)
-        return self._skipped_before + (0 if learner is None else learner.guard.total())
+        return None if learner is None else learner.guard
 
-    @skipped_updates.setter
-    def skipped_updates(self, count: int) -> None:
-        # As of a file, before there is a learner.
-        self._skipped_before = count
+    # -- acting --------------------------------------------------------------------------------------------------------
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """See :meth:`DreamerPolicy.predict`; plans if a planner is set and its time has come."""
+        self.policy.planning = self._planner_is_on()
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def _planner_is_on(self) -> bool:
+        due = self.phase_timesteps >= self.learning_starts + self.planner_delay
+        return self.planner is not None and phases.PHASES[self.phase].plans and due and self.policy.agent.trains_behavior()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One step of the recurrent agent; what it remembers is the action *as executed*."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        state = self._acting_state or self.policy.initial_state(n_envs)
+        self.policy.planning = self._planner_is_on()
+        with th.no_grad():
+            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
+            actions = self._random_actions(learning_starts, n_envs)
+            if actions is None:
+                state = self.policy.choose(state, deterministic=False)
+                actions = state.action.cpu().numpy()
+        actions = self._as_executed(actions, action_noise)
+        state.action = th.as_tensor(actions, device=self.device)
+        self._acting_state = state
+        return self.policy.to_env_action(actions), actions
+
+    def _replayed_beside(self) -> dict[str, np.ndarray]:
+        assert self._acting_state is not None
+        return {"skill": self._acting_state.skill.cpu().numpy()} if self.skill_size else {}
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
-        """Leave pre-training: what ``transfer.TRANSFER`` keeps stays, everything else starts afresh (paper §3).
-
-        The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
-
-        :param env: the fine-tuning environment; None stays in the same one
-        :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
-        :param keep_critic: for ablations
-        :raises ValueError: if the model is not pre-training
-        """
-        if self.phase != phases.PRETRAINING:
-            raise ValueError(f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}.")
-        if env is not None:
-            self.set_env(env)
-        if keep_actor is None:
-            keep_actor = phases.keeps_actor(self.domain)
-        pretrained = self.policy.agent
-        self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
-        self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
-        self.replay_buffer.close()
-        del self.replay_buffer
-        self._build()
-        transfer.transfer(pretrained, self.policy.agent, keep_actor, keep_critic)
-        self._last_obs = None
+    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:
+        assert isinstance(pretrained, DreamerPolicy)
+        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
 
     def fix_skill(self, skill: int | np.ndarray | None) -> None:
         """Follow one skill from now on, in training as in ``predict`` (DIAYN, APS).
@@ -416,50 +392,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfDreamerV2:
-        """Collect and learn for ``total_timesteps`` agent steps; as SB3's, but warm-ups count by phase, not by call.
-
-        :param total_timesteps: agent steps; where a ``RunCheckpointCallback(..., resume="auto")`` goes on with a run, of the
-            whole run
-        :param callback: SB3 callback(s)
-        :param log_interval: episodes between two log lines
-        :param tb_log_name: name of the TensorBoard run
-        :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
-        :param progress_bar: show one
-        :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
-        :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
-        """
-        with self.during_learn:
-            if run_checkpoints.resume_if_asked(self, callback):
-                total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False
-            total_timesteps, callbacks = self._setup_learn(
-                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-            )
-            callbacks.on_training_start(locals(), globals())
-            try:
-                training_loop.learn(self, total_timesteps, callbacks, log_interval)
-            except (EnvironmentFaultError, numerical_faults.NumericalFaultError) as error:
-                raise type(error)(f"{error} {save_last_good_state(self)}") from error
-            callbacks.on_training_end()
-            return self
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps or self._last_obs is None:
-            # The environments are about to be reset.
-            self.replay_buffer.close_streams()
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if self.run_folder is not None:
-            self.run_folder.restore_normalization(self)
-        self._logged_phase = None
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)
-        return result
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Update on replayed sequences; does nothing while no finished episode is long enough.
@@ -482,7 +415,7 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
-        numerical_faults.stop_if_repeated(self)
+        self.learner.guard.stop_if_repeated(self.num_timesteps)
 
     def _set_learning_rates(self) -> None:
         # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.
@@ -492,16 +425,3 @@ class DreamerV2(ActingAlgorithm, SavingAlgorithm):
             optimizer.set_learning_rate(rates.get(name, self.lr_schedule)(remaining))
         self.logger.record("train/learning_rate", self.lr_schedule(remaining))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def dump_logs(self) -> None:
-        """Write the log; the only place where metrics leave the device."""
-        for name, value in self._metrics.take().items():
-            self.logger.record(f"train/{name}", value)
-        self.logger.record("train/skipped_updates", self.skipped_updates)
-        self.logger.record("rollout/env_faults", self.env_faults)
-        # TensorBoard shows texts one by one: once a phase will do.
-        self.logger.record("time/phase", self.phase, exclude="tensorboard" if self.phase == self._logged_phase else None)
-        self._logged_phase = self.phase
-        self.logger.record("time/phase_frames", self.phase_frames)
-        self.logger.record("time/total_frames", self.num_timesteps * self.action_repeat)
-        super().dump_logs()

@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.dreamer_v2 import arguments
+from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
 from sb3_dreamer_urlb.types import Observation
 
@@ -74,11 +74,11 @@ def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None) -> VecEnv:
 
 def _same_again(model: DreamerV2) -> gymnasium.Env[Any, Any]:
     train_env = model.get_env()
-    spec = None if train_env is None else arguments.env_attribute(train_env, "spec", None)
+    spec = None if train_env is None else env_attribute(train_env, "spec", None)
     if train_env is None or spec is None:
         raise ValueError("Another environment like the model's cannot be made, as it has no registered id: give env.")
     kwargs = {**spec.kwargs}
-    if "rgb_array" in arguments.env_attribute(train_env, "metadata", {}).get("render_modes", ()):
+    if "rgb_array" in env_attribute(train_env, "metadata", {}).get("render_modes", ()):
         kwargs["render_mode"] = "rgb_array"
     return gymnasium.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
 
@@ -154,7 +154,7 @@ def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = 
         last = infos[0].get("terminal_observation") if start[0] else None
         observations.append(observation if last is None else _batch_of_one(last))
         actions.append(action[0])
-    fps = arguments.env_attribute(env, "metadata", {}).get("render_fps") or DEFAULT_FPS
+    fps = env_attribute(env, "metadata", {}).get("render_fps") or DEFAULT_FPS
     return Recording(_stacked(observations), np.stack(actions), frames, float(fps))
 
 

@@ -16,7 +16,6 @@ import sb3_dreamer_urlb
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.snapshots.model_data import argument, argument_names
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -249,10 +248,9 @@ def changed_arguments(model: DreamerV2) -> dict[str, Any]:
     kind = type(model.policy)
     aliases = [alias for alias, known in model.policy_aliases.items() if known is kind]
     found: dict[str, Any] = {"policy": (aliases or [kind.__name__])[0]}
-    for name in argument_names(type(model)):
+    for name, value in model.arguments().items():
         if name in NOT_LISTED:
             continue
-        value = argument(model, name)
         if name == "train_freq":
             value = value.frequency if value.unit.value == "step" else (value.frequency, value.unit.value)
         # None, {} and what the preset filled in compare by what they are now.

@@ -19,7 +19,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.dreamer_v2 import arguments
+from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository
@@ -167,7 +167,7 @@ def check_installed(film: bool) -> None:
 
 
 def _id_of(env: VecEnv) -> str:
-    spec = arguments.env_attribute(env, "spec", None)
+    spec = env_attribute(env, "spec", None)
     if spec is None:
         raise ValueError("The environment has no registered id: give env_id, for the model card.")
     return str(spec.id)

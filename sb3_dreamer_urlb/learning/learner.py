@@ -77,7 +77,8 @@ class Learner:
             self.reward_source = agent.intrinsic
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
-        self.guard = UpdateGuard(agent, self.optimizers())
+        statistics = [agent.reward_normalizer, *([] if agent.intrinsic is None else [agent.intrinsic])]
+        self.guard = UpdateGuard(self.optimizers(), statistics)
         #: what an update does on the device, recorded if that is wanted and possible
         self.recorder: Recorder[Metrics] = Recorder(
             self._update, make_backend(config.compile, self.device), self._memory, "The update"

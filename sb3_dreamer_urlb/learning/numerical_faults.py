@@ -7,17 +7,13 @@ counts, and the statistics that a bad batch must not spoil either. Only :meth:`U
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import torch as th
+from torch import nn
 
-from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 #: skipped updates in a row that end a run; looked at every so many updates
 MAX_IN_A_ROW = 20
@@ -30,14 +26,14 @@ class NumericalFaultError(ValueError):
 class UpdateGuard:
     """Counts the updates that were skipped, and keeps running statistics finite.
 
-    :param agent: whose statistics to keep
-    :param optimizers: of its parts, by name
+    :param optimizers: of an agent's parts, by name
+    :param statistics: modules whose buffers of numbers an update changes without an optimiser
     """
 
-    def __init__(self, agent: Agent, optimizers: dict[str, ClippedAdam]):
-        self.agent = agent
+    def __init__(self, optimizers: dict[str, ClippedAdam], statistics: Iterable[nn.Module] = ()):
         self.optimizers = optimizers
-        device = next(agent.parameters()).device
+        self.statistics = tuple(statistics)
+        device = next(iter(optimizers.values())).parameters[0].device
         #: which parts' steps the last update skipped, in the order of ``optimizers``
         self.skipped = th.zeros(len(optimizers), dtype=th.bool, device=device)
         self._good = th.zeros((), dtype=th.bool, device=device)
@@ -53,10 +49,11 @@ class UpdateGuard:
         statistics = self._statistics()
         before = [value.clone() for value in statistics]
         yield
-        # All or none: a mean must not stay behind its count.
-        finite = th.stack([value.isfinite().all() for value in statistics]).all()
-        for value, old in zip(statistics, before, strict=True):
-            value.copy_(th.where(finite, value, old))
+        if statistics:
+            # All or none: a mean must not stay behind its count.
+            finite = th.stack([value.isfinite().all() for value in statistics]).all()
+            for value, old in zip(statistics, before, strict=True):
+                value.copy_(th.where(finite, value, old))
         # A part that had nothing to learn skipped nothing.
         flags = [self._good if o.skipped is None else o.skipped for o in self.optimizers.values()]
         self.skipped.copy_(th.stack(flags))
@@ -70,13 +67,12 @@ class UpdateGuard:
         self._since_check += 1
 
     def memory(self) -> tuple[th.Tensor, ...]:
-        """All tensors that :meth:`watching` reads and writes, besides the agent's statistics."""
+        """All tensors that :meth:`watching` reads and writes, besides the statistics."""
         return self.skipped, self._good, self._in_a_row, self._total
 
     def _statistics(self) -> list[th.Tensor]:
         """What updates change without an optimiser."""
-        modules = [self.agent.reward_normalizer, *([] if self.agent.intrinsic is None else [self.agent.intrinsic])]
-        return [value for module in modules for value in module.buffers() if value.is_floating_point()]
+        return [value for module in self.statistics for value in module.buffers() if value.is_floating_point()]
 
     def repeated(self) -> list[str]:
         """The parts that kept the last ``MAX_IN_A_ROW`` updates from being learnt; looks only every so many updates."""
@@ -91,17 +87,16 @@ class UpdateGuard:
         """Skipped updates so far."""
         return int(self._total)
 
+    def stop_if_repeated(self, step: int) -> None:
+        """End a run that no longer learns: its weights are those of the last good update, and ``learn`` saves them.
 
-def stop_if_repeated(model: DreamerV2) -> None:
-    """End a run that no longer learns: its weights are those of the last good update, and ``learn`` saves them.
-
-    :param model: after its updates
-    :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts
-    """
-    parts = [name.removesuffix("_optimizer") for name in model.learner.guard.repeated()]
-    if not parts:
-        return
-    raise NumericalFaultError(
-        f"At step {model.num_timesteps}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
-        f"the {' and the '.join(parts)} was not finite. Smaller learning rates may help."
-    )
+        :param step: for the message
+        :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts
+        """
+        parts = [name.removesuffix("_optimizer") for name in self.repeated()]
+        if not parts:
+            return
+        raise NumericalFaultError(
+            f"At step {step}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
+            f"the {' and the '.join(parts)} was not finite. Smaller learning rates may help."
+        )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.runs.contract import RunningAlgorithm
 
 
-def save_last_good_state(model: DreamerV2) -> str:
+def save_last_good_state(model: RunningAlgorithm) -> str:
     """Write a checkpoint where a RunCheckpointCallback keeps the run, else a snapshot into the folder of the log.
 
     :param model: whose weights are finite

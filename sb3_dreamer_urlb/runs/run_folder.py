@@ -11,27 +11,26 @@ import fcntl
 import os
 import warnings
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_dreamer_urlb.evaluation import history as evaluations
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming, reading
 from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
-    from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-
-Model = TypeVar("Model", bound="DreamerV2")
+Model = TypeVar("Model", bound=SavedAlgorithm)
 
 SNAPSHOT, REPLAY, LOCK = "snapshot.zip", "replay", "lock"
 FIELDS = {"number", "segments", "open", "evicted", "finished_count", "longest", "evaluation"}
@@ -80,7 +79,7 @@ class RunFolder:
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def save(self, model: DreamerV2, evaluation: dict[str, Any] | None = None) -> None:
+    def save(self, model: SavedAlgorithm, evaluation: dict[str, Any] | None = None) -> None:
         """Write a checkpoint; only what is new of the replay.
 
         :param model: between two rollouts, if it is to go on bit for bit
@@ -151,7 +150,7 @@ class RunFolder:
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
-    def restore(self, model: DreamerV2, run: Any, statistics: dict[str, th.Tensor]) -> None:
+    def restore(self, model: SavedAlgorithm, run: Any, statistics: dict[str, th.Tensor]) -> None:
         """Fill the replay of a model that was loaded from this folder's checkpoint, and its VecNormalize.
 
         :param model: with an empty replay
@@ -169,7 +168,7 @@ class RunFolder:
             self.segments = [Segment(_plain_name(name), int(end)) for name, end in run["segments"]]
             open_name = None if run["open"] is None else _plain_name(run["open"])
             numbers = {name: int(run[name]) for name in ("evicted", "finished_count", "longest")}
-            self.evaluation = None if run["evaluation"] is None else evaluations.checked(run["evaluation"])
+            self.evaluation = None if run["evaluation"] is None else evaluation_history.checked(run["evaluation"])
             normalizer = model.get_vec_normalize_env()
             if normalizer is not None and statistics:
                 normalization.restore(normalizer, statistics)
@@ -190,17 +189,17 @@ class RunFolder:
         replay_snapshot.restore(buffer, episodes[numbers["evicted"] - first :], open_, numbers)
         self._restored(buffer)
 
-    def restore_normalization(self, model: DreamerV2) -> None:
+    def restore_normalization(self, normalizer: VecNormalize | None, restart: Callable[[], None]) -> None:
         """Give the statistics to the environment that the run goes on in, which has just been reset.
 
         What the reset added to them is undone: the observation that it stands for was counted when the run was left.
 
-        :param model: about to learn
-        :raises ValueError: if its environment has no VecNormalize
+        :param normalizer: of the environment, None without
+        :param restart: resets it once more
+        :raises ValueError: if the environment has no VecNormalize
         """
         if self.statistics is None:
             return
-        normalizer = model.get_vec_normalize_env()
         if normalizer is None and self.statistics:
             raise ValueError(f"The run in {self.path} normalises with VecNormalize, its environment is wrapped in none now.")
         if normalizer is not None and not self.statistics:
@@ -209,7 +208,7 @@ class RunFolder:
             with blaming(str(self.snapshot)):
                 normalization.restore(normalizer, self.statistics)
             training, normalizer.training = normalizer.training, False
-            model.restart_episodes()
+            restart()
             normalizer.training = training
         self.statistics = None
 
@@ -242,19 +241,19 @@ def steps_done(folder: str | os.PathLike[str]) -> int:
         return int(archive.data["counters"]["num_timesteps"])
 
 
-def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **kwargs: Any) -> Model | None:
+def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **kwargs: Any) -> tuple[Model, RunFolder] | None:
     """Go on with a run.
 
     :param algorithm: class of the model
     :param folder: of the run
     :param env: environment to go on in
     :param kwargs: of :func:`sb3_dreamer_urlb.snapshots.model.load`
-    :return: the model with its replay; None if there is no checkpoint yet
+    :return: the model with its replay, and the folder; None if there is no checkpoint yet
     :raises NotADirectoryError: for a file
     """
     if os.path.isfile(folder):
         raise NotADirectoryError(
-            f"resume() takes the folder of a run, got the file {os.fspath(folder)!r}: DreamerV2.load reads it."
+            f"resume() takes the folder of a run, got the file {os.fspath(folder)!r}: {algorithm.__name__}.load reads it."
         )
     run_folder = RunFolder(folder)
     if not run_folder.snapshot.exists():
@@ -262,9 +261,8 @@ def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **k
     with run_folder.locked():
         model, run, statistics = model_snapshot.load(algorithm, run_folder.snapshot, env, resume=True, **kwargs)
         run_folder.restore(model, run, statistics)
-    model.run_folder = run_folder
     if model.env is not None and model.seed is not None:
         # The run's own seed would bring the first episodes' resets back.
         sequence = np.random.SeedSequence([model.seed, model.num_timesteps])
         model.env.seed(int(sequence.generate_state(1)[0]) >> 1)
-    return model
+    return model, run_folder

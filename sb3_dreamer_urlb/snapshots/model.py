@@ -1,11 +1,11 @@
-"""DreamerV2 ↔ a file: constructor arguments, counters, random states, weights and the optimisers' moments.
+"""An algorithm ↔ a file: constructor arguments, counters, random states, weights and the optimisers' moments.
 
 Not in the file: the replay (``save_replay_buffer``, or a run folder), the environment, and the episode that is open.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import maybe_make_env
@@ -15,13 +15,11 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.snapshots import normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
 from sb3_dreamer_urlb.snapshots.random_state import RandomStates
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
-
-Model = TypeVar("Model", bound="DreamerV2")
+Model = TypeVar("Model", bound=SavedAlgorithm)
 
 KIND = "model"
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -30,7 +28,7 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 # -- saving ----------------------------------------------------------------------------------------------------------------
 
 
-def save(model: DreamerV2, target: Target, run: dict[str, Any] | None = None) -> None:
+def save(model: SavedAlgorithm, target: Target, run: dict[str, Any] | None = None) -> None:
     """Write a model; a path atomically.
 
     :param model: what to save
@@ -47,13 +45,17 @@ def save(model: DreamerV2, target: Target, run: dict[str, Any] | None = None) ->
         writer.finish(describe(model, run))
 
 
-def _all_tensors(model: DreamerV2) -> dict[str, th.Tensor]:
+def _all_tensors(model: SavedAlgorithm) -> dict[str, th.Tensor]:
     found = _named(model.policy)
-    for name, optimizer in model.learner.optimizers().items():
-        for i, parameter in enumerate(optimizer.parameters):
-            for key, value in optimizer.adam.state.get(parameter, {}).items():
+    for name, adam in model.adams().items():
+        for i, parameter in enumerate(_parameters(adam)):
+            for key, value in adam.state.get(parameter, {}).items():
                 found[f"{name}.{i}.{key}"] = value
     return found
+
+
+def _parameters(adam: th.optim.Adam) -> list[th.nn.Parameter]:
+    return [parameter for group in adam.param_groups for parameter in group["params"]]
 
 
 def _named(policy: th.nn.Module) -> dict[str, th.Tensor]:
@@ -148,10 +150,10 @@ def _prepared(
         raise CallersError(error) from None
 
 
-def _build_checked(model: DreamerV2, archive: Archive) -> None:
+def _build_checked(model: SavedAlgorithm, archive: Archive) -> None:
     """Build the networks only after the file's tensors turned out to be of just their sizes."""
     found, _ = normalization.split(tensors.read_table(archive, TENSORS))
-    described = tensors.table_without_memory(lambda: model._new_policy(model._intrinsic()), found)
+    described = tensors.table_without_memory(model._new_policy, found)
     expected = {f"policy.{name}": entry for name, entry in described.items()}
     tensors.compare({name: entry for name, entry in found.items() if name.startswith("policy.")}, expected)
     model.set_random_seed(model.seed)
@@ -159,35 +161,35 @@ def _build_checked(model: DreamerV2, archive: Archive) -> None:
     tensors.compare(found, _with_moments(model, expected, found))
 
 
-def _with_moments(model: DreamerV2, weights: tensors.Table, found: tensors.Table) -> tensors.Table:
+def _with_moments(model: SavedAlgorithm, weights: tensors.Table, found: tensors.Table) -> tensors.Table:
     """The table of a file with these weights; an optimiser has moments from its first update on."""
     expected = dict(weights)
-    for name, optimizer in model.learner.optimizers().items():
+    for name, adam in model.adams().items():
         if not any(key.startswith(f"{name}.") for key in found):
             continue
-        for i, parameter in enumerate(optimizer.parameters):
+        for i, parameter in enumerate(_parameters(adam)):
             expected[f"{name}.{i}.step"] = ("F32", ())
             expected |= {f"{name}.{i}.{key}": (tensors.DTYPES[parameter.dtype], tuple(parameter.shape)) for key in MOMENTS}
     return expected
 
 
-def _put(model: DreamerV2, loaded: dict[str, th.Tensor]) -> None:
+def _put(model: SavedAlgorithm, loaded: dict[str, th.Tensor]) -> None:
     """Copy tensors of a checked table into the model."""
     for name, value in loaded.items():
         if name.endswith((".step", ".exp_avg_sq")) and not name.startswith("policy.") and bool((value < 0).any()):
             raise ValueError(f"the tensor {name!r} holds negative values")
     model.policy.load_state_dict({name.removeprefix("policy."): v for name, v in loaded.items() if name.startswith("policy.")})
-    for name, optimizer in model.learner.optimizers().items():
+    for name, adam in model.adams().items():
         state = {
             i: {key: loaded[f"{name}.{i}.{key}"] for key in ("step", *MOMENTS)}
-            for i in range(len(optimizer.parameters))
+            for i in range(len(_parameters(adam)))
             if f"{name}.{i}.step" in loaded
         }
         # The settings stay the arguments'.
-        optimizer.adam.load_state_dict({"state": state, "param_groups": optimizer.adam.state_dict()["param_groups"]})
+        adam.load_state_dict({"state": state, "param_groups": adam.state_dict()["param_groups"]})
 
 
-def set_parameters(model: DreamerV2, source: Target, exact_match: bool) -> None:
+def set_parameters(model: SavedAlgorithm, source: Target, exact_match: bool) -> None:
     """Take weights and moments over from a file.
 
     :param model: changed in place; as a whole, or not at all

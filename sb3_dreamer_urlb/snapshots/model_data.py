@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch as th
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
 from sb3_dreamer_urlb.snapshots import values
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.random_state import capture
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+Model = TypeVar("Model", bound=SavedAlgorithm)
 
-Model = TypeVar("Model", bound="DreamerV2")
-
-#: constructor arguments that are the loader's business
-NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
-#: arguments whose attribute SB3 calls otherwise
-ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
 COUNTERS = (
     "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates",
     "phase_timesteps", "phase_updates", "phase_frames", "pretrained_frames", "action_repeat", "env_faults", "skipped_updates",
@@ -55,7 +48,7 @@ CHECKS: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def describe(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
+def describe(model: SavedAlgorithm, run: dict[str, Any] | None) -> dict[str, Any]:
     """All of a model but its tensors, as JSON.
 
     :param model: what to describe
@@ -82,21 +75,11 @@ def describe(model: DreamerV2, run: dict[str, Any] | None) -> dict[str, Any]:
     }
 
 
-def describe_arguments(model: DreamerV2) -> dict[str, Any]:
+def describe_arguments(model: SavedAlgorithm) -> dict[str, Any]:
     """The constructor arguments of a model, as JSON."""
-    arguments = {name: argument(model, name) for name in argument_names(type(model))}
+    arguments = model.arguments()
     arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
     return {name: values.encode_or_describe(value) for name, value in arguments.items()}
-
-
-def argument(model: DreamerV2, name: str) -> Any:
-    """A constructor argument, as the model has it."""
-    return getattr(model, ATTRIBUTES.get(name, name))
-
-
-def argument_names(algorithm: type[DreamerV2]) -> list[str]:
-    """The constructor arguments that files hold."""
-    return [name for name in inspect.signature(algorithm.__init__).parameters if name not in NOT_STORED]
 
 
 def blank(
@@ -111,7 +94,7 @@ def blank(
     :param kwargs: replaces arguments, too
     :raises ValueError: for arguments that are damaged, or that no file can hold and nobody gave
     """
-    known = argument_names(algorithm)
+    known = algorithm.argument_names()
     arguments = dict(data["arguments"])
     unknown = sorted(set(arguments) - set(known))
     if unknown:
@@ -137,7 +120,9 @@ def blank(
         )
     # The stored arguments are complete: the preset must not fill anything in.
     preset = decoded.pop("preset", "paper")
-    model = algorithm(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
+    constructor: Any = algorithm
+    model: Model
+    model = constructor(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
     model.preset = preset
     return model
 
@@ -156,7 +141,7 @@ def needed(data: dict[str, Any]) -> list[str]:
     return names + ["policy_class"] * ("policy" in names)
 
 
-def restore_fields(model: DreamerV2, data: dict[str, Any]) -> None:
+def restore_fields(model: SavedAlgorithm, data: dict[str, Any]) -> None:
     """Everything that is neither argument nor tensor.
 
     :param model: blank

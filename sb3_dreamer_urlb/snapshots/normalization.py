@@ -5,14 +5,11 @@ The statistics are the run's, everything else of a VecNormalize (what it normali
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch as th
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.snapshots.tensors import Table
+from sb3_dreamer_urlb.snapshots.tensors import Table
 
 #: what the names of these tensors begin with, beside the model's own
 PREFIX = "normalization."

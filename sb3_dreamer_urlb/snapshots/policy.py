@@ -1,23 +1,21 @@
-"""DreamerPolicy ↔ a file: constructor arguments and weights."""
+"""A policy ↔ a file: constructor arguments and weights."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch as th
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
-
-Policy = TypeVar("Policy", bound="DreamerPolicy")
+Policy = TypeVar("Policy", bound=BasePolicy)
 KIND = "policy"
 
 
-def save(policy: DreamerPolicy, target: Target) -> None:
+def save(policy: BasePolicy, target: Target) -> None:
     """Write a policy; a path atomically and exactly as it is given.
 
     :param policy: what to save
@@ -53,8 +51,11 @@ def load(kind: type[Policy], source: Target, device: th.device | str, custom_obj
                     f"give it again: load(..., custom_objects={{{name!r}: ...}})"
                 )
         found = tensors.read_table(archive, TENSORS)
-        tensors.compare(found, tensors.table_without_memory(lambda: kind(lr_schedule=_no_schedule, **parameters), found))
-        policy = kind(lr_schedule=_no_schedule, **parameters)
+        constructor: Any = kind
+        tensors.compare(
+            found, tensors.table_without_memory(lambda: constructor(lr_schedule=_no_schedule, **parameters), found)
+        )
+        policy: Policy = constructor(lr_schedule=_no_schedule, **parameters)
         policy.load_state_dict(tensors.unpack(archive, TENSORS))
         return policy.to(device)
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 
 
 def generator_state(generator: np.random.Generator) -> dict[str, Any]:
@@ -24,7 +23,7 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def capture(model: DreamerV2) -> dict[str, Any]:
+def capture(model: SavedAlgorithm) -> dict[str, Any]:
     """All states, as JSON."""
     version, internal, gauss = random.getstate()
     return {
@@ -67,7 +66,7 @@ class RandomStates:
         for generator_state in (self.sampler, self.action_space):
             set_generator(np.random.default_rng(), generator_state)
 
-    def apply(self, model: DreamerV2) -> None:
+    def apply(self, model: SavedAlgorithm) -> None:
         """Set the global generators, and the model's."""
         th.set_rng_state(self.torch)
         if self.cuda is not None and model.device.type == "cuda":

@@ -6,18 +6,16 @@ Each ``rows-…`` member holds whole episodes: their lengths and, one after the 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import safetensors.numpy
 
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.episode import Episode
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import Archive, Target, reading, writing
 from sb3_dreamer_urlb.snapshots.random_state import generator_state, set_generator
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 KIND = "replay"
 #: bytes that a member should have; one long episode may exceed it

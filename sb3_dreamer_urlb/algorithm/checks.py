@@ -1,0 +1,102 @@
+"""Checks of what users hand to any algorithm of this package: one clear error, before any time is spent."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_integer, is_number
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+
+#: range of a number: (low, low allowed, high, high allowed)
+Range = tuple[float, bool, float, bool]
+
+
+def check_verbose(verbose: Any) -> None:
+    """Before Stable-Baselines3 compares it with numbers.
+
+    :raises ValueError: for anything but 0, 1 and 2
+    """
+    if not is_integer(verbose) or not 0 <= verbose <= 2:
+        raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
+
+
+def check_settings(model: SavedAlgorithm) -> None:
+    """What is not an algorithm's own, but Stable-Baselines3's: it takes anything, and fails later.
+
+    :param model: with its arguments, nothing built
+    :raises ValueError: naming the argument, its value and what was expected
+    """
+    check_integer("stats_window_size", model._stats_window_size, 1)
+    if model.seed is not None and not (is_integer(model.seed) and 0 <= model.seed < 2**32):
+        raise ValueError(f"seed must be an integer in [0, 2**32), or None, got {model.seed!r}.")
+    if model.tensorboard_log is not None and not isinstance(model.tensorboard_log, str | os.PathLike):
+        raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
+    for name in ("policy_kwargs", "replay_buffer_kwargs"):
+        check_dict(name, getattr(model, name))
+
+
+def check_schedule_of_updates(model: SavedAlgorithm) -> None:
+    """When updates happen, and how many.
+
+    :param model: with its arguments, nothing built
+    :raises ValueError: naming the argument, its value and what was expected
+    """
+    frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
+    if not is_integer(frequency) or frequency < 1:
+        raise ValueError(f"train_freq must be a positive integer, or such a one with its unit, got {model.train_freq!r}.")
+    if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
+        raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
+
+
+def check_noise(model: SavedAlgorithm) -> None:
+    """
+    :param model: with its arguments, nothing built
+    :raises ValueError: for what is no noise of Stable-Baselines3's
+    """
+    if model.action_noise is not None and not isinstance(model.action_noise, ActionNoise):
+        raise ValueError(f"action_noise must be an ActionNoise of Stable-Baselines3 or None, got {model.action_noise!r}.")
+
+
+def check_number(name: str, value: Any, bounds: Range) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :param bounds: where it must lie
+    :raises ValueError: if it is no number, or lies elsewhere
+    """
+    low, low_ok, high, high_ok = bounds
+    if not (is_number(value) and (low < value < high or (low_ok and value == low) or (high_ok and value == high))):
+        interval = f"{'[' if low_ok else '('}{low:g}, {high:g}{']' if high_ok else ')'}"
+        raise ValueError(f"{name} must lie in {interval}, got {value!r}.")
+
+
+def check_env(model: SavedAlgorithm, env: VecEnv) -> None:
+    """Whether a model can go on in another environment.
+
+    :param model: with its spaces
+    :param env: vectorised
+    :raises AssertionError: for another number of environments, as SB3's ``set_env``
+    :raises ValueError: for other spaces
+    """
+    if env.num_envs != model.n_envs:
+        raise AssertionError(
+            f"The number of environments differs from the model's: {env.num_envs} != {model.n_envs}. "
+            f"To change it, load a snapshot with the new ones: {type(model).__name__}.load(path, env=...)."
+        )
+    check_for_correct_spaces(env, model.observation_space, model.action_space)
+
+
+def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any]) -> None:
+    """SB3 would silently set any keyword as an attribute.
+
+    :raises TypeError: for a keyword that is no constructor argument, or one that only makes sense there
+    """
+    known = set(algorithm.argument_names()) - {"preset"} | {"device"}
+    unknown = sorted(set(kwargs) - known)
+    if unknown:
+        raise TypeError(f"load() got unknown keywords {unknown}; known are {sorted(known)}.")

@@ -1,0 +1,63 @@
+"""What a file needs to know of an algorithm: its parts by name, and how to build them anew."""
+
+from __future__ import annotations
+
+import inspect
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+
+#: constructor arguments that are the loader's business
+NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
+#: arguments whose attribute SB3 calls otherwise
+ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
+
+
+class SavedAlgorithm(OffPolicyAlgorithm):
+    """An off-policy algorithm of Stable-Baselines3 whose files hold arguments, counters and tensors, and no code.
+
+    A model is read in three steps: :meth:`_prepare` with the file's arguments, :meth:`_new_policy` without memory to compare
+    the sizes of its tensors, and :meth:`_build` to fill.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    replay_buffer: SequenceReplayBuffer
+    #: a key of :data:`sb3_dreamer_urlb.phases.PHASES`
+    phase: str
+    #: of the environment's task, None where it does not tell
+    domain: str | None
+    #: the set of hyperparameters that filled in what the caller left out
+    preset: str
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Everything of the set-up that builds nothing yet.
+
+        :raises ValueError: for arguments or spaces that do not fit
+        """
+
+    @abstractmethod
+    def _new_policy(self) -> BasePolicy:
+        """The policy of the current phase, its weights fresh; changes nothing of the model."""
+
+    @abstractmethod
+    def _build(self) -> None:
+        """Fresh networks, optimisers and replay for the current phase."""
+
+    @abstractmethod
+    def adams(self) -> dict[str, th.optim.Adam]:
+        """What holds the moments of each trained part; the names are those in files."""
+
+    @classmethod
+    def argument_names(cls) -> list[str]:
+        """The constructor arguments that files hold."""
+        return [name for name in inspect.signature(cls.__init__).parameters if name not in NOT_STORED]
+
+    def arguments(self) -> dict[str, Any]:
+        """The constructor arguments, as the model has them now."""
+        return {name: getattr(self, ATTRIBUTES.get(name, name)) for name in self.argument_names()}
