@@ -28,7 +28,7 @@ from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Obser
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
-# Deterministic predictions draw their posterior states and planning noise from this seed, always the same.
+# Deterministic predictions draw their posterior states and planning noise from seeds that begin with this number.
 DETERMINISTIC_SEED = 0
 
 # Recordings of acting to keep at a time: one and ten environments, with and without exploration.
@@ -224,9 +224,6 @@ class DreamerPolicy(BasePolicy):
         :param generator: source of randomness
         """
         with native.using(self.compile_mode, self.device):
-            if generator is not None and self.agent.skills is not None:
-                # The seed of the skill to draw is computed on the host.
-                return self._observe((observation, state, is_first), generator)
             return self._recorded()[0]((observation, state, is_first), generator, (self._skill_is_fixed(),))
 
     @th.no_grad()
@@ -247,13 +244,9 @@ class DreamerPolicy(BasePolicy):
         skills = self.agent.skills
         if skills is None:
             return skill
-        fresh = skills.sample(skill.shape[0], self._moved_on(generator, steps))
+        fresh = skills.sample(skill.shape[0], generator)
         renew = steps % skills.interval == 0 if not skills.is_fixed else th.ones_like(steps, dtype=th.bool)
         return th.where(renew.unsqueeze(-1), fresh, skill)
-
-    def _moved_on(self, generator: th.Generator | None, steps: th.Tensor) -> th.Generator | None:
-        """For draws that must differ from step to step even where equal inputs give equal actions."""
-        return generator and th.Generator(self.device).manual_seed(DETERMINISTIC_SEED + int(steps.sum()))
 
     def choose(self, state: ActingState, deterministic: bool, generator: th.Generator | None = None) -> ActingState:
         """Choose the next action, with the planner if it is on, with the actor otherwise; at random if it never learns.
@@ -264,7 +257,6 @@ class DreamerPolicy(BasePolicy):
         :return: the memory with the chosen action
         """
         if self.agent.acts_randomly():
-            generator = self._moved_on(generator, state.steps)
             action = self.actions.random(len(state.action), generator, self.device)
             return dataclasses.replace(state, action=action)
         plans = self.planner is not None and self.planning
@@ -320,7 +312,8 @@ class DreamerPolicy(BasePolicy):
         :param state: what the last call returned; None starts afresh
         :param episode_start: bool (n,), true where a new episode begins
         :param deterministic: most likely action (or plan without exploration noise); draws of the posterior and the planner
-            then come from a fixed seed, so equal inputs give equal actions and the global generators stay untouched
+            then come from the environments' step counts, which travel in ``state``: equal inputs give equal actions, the
+            steps of an episode draw independently, and the global generators stay untouched
         :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
         """
         self.set_training_mode(False)
@@ -331,12 +324,24 @@ class DreamerPolicy(BasePolicy):
         starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)
         if len(starts) != n:
             raise ValueError(f"episode_start has {len(starts)} entries for {n} observation(s).")
-        generator = th.Generator(self.device).manual_seed(DETERMINISTIC_SEED) if deterministic else None
+        generator = self._generator_of(None if state is None else state[-1], starts) if deterministic else None
         is_first = th.as_tensor(starts | (state is None), device=self.device)
         with th.no_grad():
             memory = self.choose(self.observe(tensor, memory, is_first, generator), deterministic, generator)
         action = self.to_env_action(memory.action.cpu().numpy())
         return action if vectorized else action[0], memory.to_numpy()
+
+    def _generator_of(self, steps: np.ndarray | None, starts: np.ndarray) -> th.Generator:
+        """Noise of one deterministic step: its own, and the same whenever the same step is predicted.
+
+        With the same numbers at every step, a planner would push each joint into one accidental direction all episode long.
+
+        :param steps: observations since each episode began, int64 (n,), on the host; None at the beginning
+        :param starts: where episodes begin, bool (n,)
+        """
+        begun = np.zeros(len(starts), np.int64) if steps is None else np.where(starts, 0, steps)
+        seed = np.random.SeedSequence([DETERMINISTIC_SEED, *begun.tolist()]).generate_state(1, np.uint64)[0]
+        return th.Generator(self.device).manual_seed(int(seed >> np.uint64(1)))
 
     def to_env_action(self, action: np.ndarray) -> np.ndarray:
         """From the agent's actions, (n, A), to the action space's bounds, shape and dtype."""

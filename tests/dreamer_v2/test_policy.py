@@ -87,11 +87,42 @@ def test_episode_start_resets_single_environments(acting, observations):
     for i in range(3):
         wanted, other = (fresh, kept) if starts[i] else (kept, fresh)
         assert np.array_equal(mixed[1][1][i], wanted[1][1][i]) and not np.allclose(mixed[1][1][i], other[1][1][i])
-        # A planner's noise is the same for all three calls; draws within the plan depend on all rows.
-        assert np.allclose(mixed[1][0][i], wanted[1][0][i])
-        if not acting._planner_is_on():
-            assert np.array_equal(mixed[0][i], wanted[0][i])
+        # Not the posterior's draw, and what follows from it: the noise of a call comes from the steps of all its rows.
+        assert mixed[1][-1][i] == wanted[1][-1][i] != other[1][-1][i]
     assert starts.tolist() == [False, True, False]  # evaluate_policy's own array
+
+
+def test_steps_of_a_deterministic_episode_draw_independently(acting, observations):
+    """The same state, but for the number of the step: posterior and plan are drawn anew, and always in the same way."""
+    obs = observations(2)
+    _, memory = acting.predict(obs, deterministic=True)
+
+    def at(step):
+        action, (stoch, deter, *_) = acting.predict(obs, (*memory[:-1], np.full(2, step)), deterministic=True)
+        return stoch, action, deter
+
+    steps = range(1, 33)
+    draws = [at(step) for step in steps]
+    assert all(np.array_equal(draw[2], draws[0][2]) for draw in draws)  # nothing else differs
+    for part, least in ((0, 10), (1, 10 if acting._planner_is_on() else 1)):
+        first, second = ({draw[part][row].tobytes() for draw in draws} for row in range(2))
+        assert min(len(first), len(second)) >= least
+    assert any(not np.array_equal(draw[0][0], draw[0][1]) for draw in draws)  # environments do not share noise, either
+    for step, draw in zip(steps, draws, strict=True):
+        assert all(np.array_equal(one, other) for one, other in zip(at(step), draw, strict=True))
+
+
+def test_the_mean_action_of_an_episode_has_no_accidental_direction(tiny_model, observations):
+    """With the same noise at every step, the mean over an episode would spread as much as a single action."""
+    model = tiny_model(planner="dyna_mpc")
+    model.phase_timesteps = 100
+    obs, state, episode = observations(64), None, []
+    for _ in range(25):
+        actions, state = model.predict(obs, state, deterministic=True)
+        episode.append(actions)
+    single = np.std(episode[0], axis=0).mean()
+    # 25 independent draws: a fifth; the plan carries some of its mean on. The same draws 25 times: about one.
+    assert np.std(np.mean(episode, axis=0), axis=0).mean() < 0.6 * single
 
 
 @pytest.mark.parametrize("state", [True, False])
