@@ -47,9 +47,10 @@ format: setup  ## sort imports and format the code
 	$(BIN)/ruff check --select I --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
-lint: setup  ## find faults, and code that 'make format' would change
+lint: setup  ## find faults, imports that point upwards (.importlinter), and code that 'make format' would change
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/lint-imports --no-logo
 
 type: setup  ## check the types
 	$(BIN)/mypy
@@ -79,7 +80,7 @@ setup-gl:  ## only make the virtual environment, and see to a GL library
 	@scripts/setup.sh gl
 
 clean:  ## remove caches and build output
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis demo_output site
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis demo_output site
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 clean-venv: clean  ## remove the virtual environment, too

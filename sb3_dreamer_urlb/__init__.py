@@ -5,11 +5,11 @@ who only wants an environment does not wait for torch, and the command line can 
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb._moved import keep_old_names
 from sb3_dreamer_urlb.envs import register_envs
+from sb3_dreamer_urlb.version import __version__
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
@@ -42,8 +42,6 @@ _MODULES = {
     "VideoCallback": "callbacks.videos",
     "register_intrinsic_reward": "intrinsic",
 }
-
-__version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
 __all__ = [
     "CnnPolicy",

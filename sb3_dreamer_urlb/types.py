@@ -7,31 +7,27 @@ W skill size.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch as th
 
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.spaces.observations import Observations
+from sb3_dreamer_urlb.spaces.observations import Observations
+from sb3_dreamer_urlb.spaces.raw import Observation, batch_size, map_observation
+
+__all__ = [
+    "Imagination",
+    "LatentState",
+    "MetricMeans",
+    "Metrics",
+    "ModelSizes",
+    "Observation",
+    "Posterior",
+    "SequenceBatch",
+    "batch_size",
+    "map_observation",
+]
 
 Metrics = dict[str, th.Tensor]
-#: of one kind, or several by name (Dict spaces)
-Observation = th.Tensor | dict[str, th.Tensor]
-
-
-def map_observation(function: Callable[[th.Tensor], th.Tensor], observation: Observation) -> Observation:
-    """Apply a function to an observation, or to each of several."""
-    if isinstance(observation, dict):
-        return {key: function(part) for key, part in observation.items()}
-    return function(observation)
-
-
-def batch_size(observation: Observation) -> int:
-    """Length of the first dimension."""
-    first = next(iter(observation.values())) if isinstance(observation, dict) else observation
-    return len(first)
 
 
 @dataclass

@@ -106,7 +106,7 @@ def _attribute(env: VecEnv, name: str) -> Any:
 
 def versions() -> str:
     """Of Python and the packages that results depend on, and of this one."""
-    from sb3_dreamer_urlb import __version__
+    from sb3_dreamer_urlb.version import __version__
 
     found = [f"sb3_dreamer_urlb {__version__}", f"python {platform.python_version()}"]
     for package in PACKAGES:

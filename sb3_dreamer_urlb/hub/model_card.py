@@ -12,10 +12,10 @@ import gymnasium
 import stable_baselines3
 import torch as th
 
-import sb3_dreamer_urlb
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.snapshots import values
+from sb3_dreamer_urlb.version import __version__
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -194,7 +194,7 @@ Files are JSON and safetensors: loading them runs no code.
 
 {command}
 
-sb3_dreamer_urlb {sb3_dreamer_urlb.__version__}, Stable-Baselines3 {stable_baselines3.__version__}, \
+sb3_dreamer_urlb {__version__}, Stable-Baselines3 {stable_baselines3.__version__}, \
 torch {th.__version__}, gymnasium {gymnasium.__version__}, Python {sys.version.split()[0]}.
 
 Hyperparameters that differ from the defaults, which are the paper's
@@ -261,4 +261,4 @@ def changed_arguments(model: DreamerV2) -> dict[str, Any]:
 
 def config(facts: ModelFacts, model_file: str) -> dict[str, Any]:
     """``config.json``: which file is the model, and the facts; the Hub counts downloads by it."""
-    return {"library": "sb3_dreamer_urlb", "version": sb3_dreamer_urlb.__version__, "model": model_file, **asdict(facts)}
+    return {"library": "sb3_dreamer_urlb", "version": __version__, "model": model_file, **asdict(facts)}

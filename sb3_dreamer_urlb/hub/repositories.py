@@ -8,8 +8,8 @@ from abc import ABC, abstractmethod
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
-import sb3_dreamer_urlb
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
+from sb3_dreamer_urlb.version import __version__
 
 RepoId = str | os.PathLike[str]
 
@@ -91,7 +91,7 @@ class HubRepository(Repository):
         except ImportError as error:
             raise ImportError(MISSING_HUB) from error
         self.revision, self.private = revision, private
-        self.api = HfApi(token=token, library_name=LIBRARY, library_version=sb3_dreamer_urlb.__version__)
+        self.api = HfApi(token=token, library_name=LIBRARY, library_version=__version__)
 
     def upload(self, folder: Path, message: str) -> str:
         url = self.api.create_repo(repo_id=self.name, private=self.private, exist_ok=True)

@@ -14,6 +14,7 @@ from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
 from sb3_dreamer_urlb.nn.nets import ReLUNet
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.types import Metrics, ModelSizes, Observation, Posterior, SequenceBatch, map_observation
+from sb3_dreamer_urlb.world_model.encoder import make_encoder
 
 BOUND = 5.0
 
@@ -27,7 +28,7 @@ class ObservationNet(nn.Module):
 
     def __init__(self, sizes: ModelSizes, outputs: int):
         super().__init__()
-        self.encoder = sizes.observations.make_encoder(sizes.cnn_depth, sizes.net_arch)
+        self.encoder = make_encoder(sizes.observations, sizes.cnn_depth, sizes.net_arch)
         for layer in self.encoder.modules():
             if isinstance(layer, (nn.Conv2d, nn.Linear)):
                 assert layer.bias is not None

@@ -1,29 +1,25 @@
 """What an agent may see: images, vectors, or several of both by name. Made from the observation space.
 
-Each kind knows how to prepare raw observations for the networks, which encoder and decoder it needs, and how well a
-decoded observation fits. The world model asks these questions and never looks at the space itself.
+Each kind knows how to prepare raw observations for the networks, and how well a decoded observation fits. Nobody else looks
+at the space itself. Which networks read and predict a kind, ``world_model/encoder.py`` and ``decoder.py`` say.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from torch import nn
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import pixel_ops
 from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.spaces.choices import classes_of, one_hot_numbers
 from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
-from sb3_dreamer_urlb.types import Metrics, Observation
-from sb3_dreamer_urlb.world_model.decoder import ConvDecoder, DictDecoder, VectorDecoder
-from sb3_dreamer_urlb.world_model.encoder import ConvEncoder, DictEncoder, Encoder, VectorEncoder
+from sb3_dreamer_urlb.spaces.raw import Observation
 
 IMAGE_SIZES = (16, 512)
 
@@ -36,19 +32,7 @@ class Observations(ABC):
         """What the networks see and predict, float32 (…)."""
 
     @abstractmethod
-    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
-        """From preprocessed observations to embeddings, float (…, ``encoder.embed_size``).
-
-        :param cnn_depth: channels of the first convolution
-        :param net_arch: hidden layers where there is nothing to convolve
-        """
-
-    @abstractmethod
-    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
-        """From features, float (…, F), to the mean of a unit normal over preprocessed observations."""
-
-    @abstractmethod
-    def losses(self, mean: Observation, target: Observation) -> Metrics:
+    def losses(self, mean: Observation, target: Observation) -> dict[str, th.Tensor]:
         """Negative log-likelihood of what was seen, summed over an observation, averaged over them: scalars by name.
 
         :param mean: decoded
@@ -104,13 +88,7 @@ class Images(Observations):
             image = image.flatten(0, -4).contiguous(memory_format=th.channels_last).view(image.shape)
         return th.div(image if self.low == 0 else image - self.low, self.range).sub_(0.5)
 
-    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
-        return ConvEncoder(self.shape, cnn_depth)
-
-    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
-        return ConvDecoder(feature_size, self.shape, cnn_depth)
-
-    def losses(self, mean: Observation, target: Observation) -> Metrics:
+    def losses(self, mean: Observation, target: Observation) -> dict[str, th.Tensor]:
         assert isinstance(mean, th.Tensor) and isinstance(target, th.Tensor)
         return {"image_loss": distributions.image_nll(mean, target)}
 
@@ -131,13 +109,7 @@ class Vectors(Observations):
     #: of the flattened vector
     size: int
 
-    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
-        return VectorEncoder(self.size, net_arch)
-
-    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
-        return VectorDecoder(feature_size, net_arch, self.size)
-
-    def losses(self, mean: Observation, target: Observation) -> Metrics:
+    def losses(self, mean: Observation, target: Observation) -> dict[str, th.Tensor]:
         assert isinstance(mean, th.Tensor) and isinstance(target, th.Tensor)
         return {"vector_loss": distributions.unit_normal_nll(mean, target).sum(-1).mean()}
 
@@ -234,15 +206,9 @@ class DictObservations(Observations):
             prepared[key] = part.preprocess(raw[key])  # type: ignore[assignment]
         return prepared
 
-    def make_encoder(self, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
-        return DictEncoder({key: part.make_encoder(cnn_depth, net_arch) for key, part in self.parts.items()})
-
-    def make_decoder(self, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
-        return DictDecoder({key: part.make_decoder(feature_size, cnn_depth, net_arch) for key, part in self.parts.items()})
-
-    def losses(self, mean: Observation, target: Observation) -> Metrics:
+    def losses(self, mean: Observation, target: Observation) -> dict[str, th.Tensor]:
         assert isinstance(mean, dict) and isinstance(target, dict)
-        total: Metrics = {}
+        total: dict[str, th.Tensor] = {}
         for key, part in self.parts.items():
             for name, loss in part.losses(mean[key], target[key]).items():
                 total[name] = total[name] + loss if name in total else loss

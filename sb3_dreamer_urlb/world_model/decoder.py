@@ -12,6 +12,7 @@ from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.nn.dense import linear, linear_elu
 from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.nn.precision import full
+from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations, Vectors
 from sb3_dreamer_urlb.world_model.convolution import convolve_elu, convolves_on_tiles
 
 
@@ -109,3 +110,22 @@ class DictDecoder(nn.Module):
     def forward(self, feature: th.Tensor) -> dict[str, th.Tensor]:
         """(…, F) → means by name."""
         return {name: decoder(feature) for name, decoder in zip(self.names, self.decoders, strict=True)}
+
+
+def make_decoder(observations: Observations, feature_size: int, cnn_depth: int, net_arch: Sequence[int]) -> nn.Module:
+    """The network that predicts one kind of observation.
+
+    :param observations: the kind; the decoder gives the mean of a unit normal over its preprocessed form
+    :param feature_size: F
+    :param cnn_depth: channels of the last hidden convolution
+    :param net_arch: hidden layers where there is nothing to convolve
+    """
+    match observations:
+        case Images():
+            return ConvDecoder(feature_size, observations.shape, cnn_depth)
+        case Vectors():
+            return VectorDecoder(feature_size, net_arch, observations.size)
+        case DictObservations():
+            parts = observations.parts.items()
+            return DictDecoder({key: make_decoder(part, feature_size, cnn_depth, net_arch) for key, part in parts})
+    raise TypeError(f"There is no decoder of {observations!r}.")

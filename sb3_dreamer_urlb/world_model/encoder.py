@@ -10,6 +10,7 @@ from torch import nn
 from sb3_dreamer_urlb.nn.activation import elu_
 from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.nn.precision import full
+from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations, Vectors
 from sb3_dreamer_urlb.world_model.convolution import convolve, convolve_elu
 
 KERNEL, STRIDE = 4, 2
@@ -90,3 +91,20 @@ class DictEncoder(Encoder):
         """Preprocessed observations by name → float (…, E)."""
         parts = zip(self.names, self.encoders, strict=True)
         return th.cat([encoder(observation[name]) for name, encoder in parts], -1)
+
+
+def make_encoder(observations: Observations, cnn_depth: int, net_arch: Sequence[int]) -> Encoder:
+    """The network that reads one kind of observation.
+
+    :param observations: the kind; its preprocessed form is what the encoder takes
+    :param cnn_depth: channels of the first convolution
+    :param net_arch: hidden layers where there is nothing to convolve
+    """
+    match observations:
+        case Images():
+            return ConvEncoder(observations.shape, cnn_depth)
+        case Vectors():
+            return VectorEncoder(observations.size, net_arch)
+        case DictObservations():
+            return DictEncoder({key: make_encoder(part, cnn_depth, net_arch) for key, part in observations.parts.items()})
+    raise TypeError(f"There is no encoder of {observations!r}.")

@@ -14,6 +14,8 @@ from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.nn.precision import short
 from sb3_dreamer_urlb.spaces.observations import Observations
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Observation, Posterior
+from sb3_dreamer_urlb.world_model.decoder import make_decoder
+from sb3_dreamer_urlb.world_model.encoder import make_encoder
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 
@@ -54,11 +56,11 @@ class WorldModel(nn.Module):
         super().__init__()
         self.gamma = gamma
         self.observations = observations
-        self.encoder = observations.make_encoder(cnn_depth, net_arch)
+        self.encoder = make_encoder(observations, cnn_depth, net_arch)
         embed = self.encoder.embed_size
         self.rssm = RSSM(action_size, embed, deter_size, hidden_size, stoch_variables, stoch_classes)
         feature = self.rssm.stoch_size + deter_size
-        self.decoder = observations.make_decoder(feature, cnn_depth, net_arch)
+        self.decoder = make_decoder(observations, feature, cnn_depth, net_arch)
         self.reward = MLP(feature, net_arch)
         self.discount_logit = MLP(feature, net_arch) if discount_head else None
         self.sizes = ModelSizes(action_size, embed, feature, deter_size, tuple(net_arch), observations, cnn_depth)

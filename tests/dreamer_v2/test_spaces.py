@@ -19,6 +19,8 @@ from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.spaces.observations import Classes, DictObservations, Images, Numbers, vectors
 from sb3_dreamer_urlb.types import LatentState
+from sb3_dreamer_urlb.world_model.decoder import make_decoder
+from sb3_dreamer_urlb.world_model.encoder import make_encoder
 
 IMAGE = spaces.Box(0, 255, (16, 20, 3), np.uint8)
 VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float64)
@@ -124,7 +126,7 @@ def test_the_parts_of_a_dict():
     kind = DictObservations(space)
     raw = {"a": th.randn(2, 5), "b": th.tensor([0, 2]), "c": th.zeros(2, 1, 16, 16, dtype=th.uint8)}
     seen = kind.preprocess(raw)
-    encoder, decoder = kind.make_encoder(2, [7, 6]), kind.make_decoder(4, 2, [7])
+    encoder, decoder = make_encoder(kind, 2, [7, 6]), make_decoder(kind, 4, 2, [7])
     embed = encoder(seen)
     assert embed.shape == (2, encoder.embed_size) and encoder.embed_size == 6 + 6 + encoder.encoders[2].embed_size
     assert th.equal(embed[:, :6], encoder.encoders[0](seen["a"])) and th.equal(embed[:, 6:12], encoder.encoders[1](seen["b"]))

@@ -1,0 +1,55 @@
+"""The rooms of the package: imports point downwards, nothing goes in a circle, and every module has its place."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "sb3_dreamer_urlb"
+
+
+def lint(folder: Path) -> subprocess.CompletedProcess[str]:
+    program = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
+    command = [sys.executable, "-c", program, "--no-cache", "--no-logo", str(ROOT / ".importlinter")]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """The package's sources, to be spoilt."""
+    shutil.copytree(ROOT / PACKAGE, tmp_path / PACKAGE, ignore=shutil.ignore_patterns("__pycache__", "*.cpp", "*.h"))
+    return tmp_path
+
+
+def test_the_contracts_hold() -> None:
+    done = lint(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 kept, 0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("learning/optim.py", "from sb3_dreamer_urlb.dreamer_v2 import DreamerV2"),
+        ("snapshots/tensors.py", "if TYPE_CHECKING:\n    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2"),
+        ("behavior/returns.py", "def late():\n    import sb3_dreamer_urlb.world_model.world_model"),
+        ("spaces/raw.py", "from sb3_dreamer_urlb.spaces.observations import Images"),
+    ],
+    ids=["upwards", "upwards for the type checker alone", "beside, late", "in a circle within a room"],
+)
+def test_an_import_that_points_elsewhere_breaks_them(copy: Path, module: str, line: str) -> None:
+    path = copy / PACKAGE / module
+    path.write_text(f"{path.read_text()}\nfrom typing import TYPE_CHECKING\n{line}\n")
+    done = lint(copy)
+    assert done.returncode == 1 and f".{Path(module).stem} -> " in done.stdout
+
+
+def test_a_module_without_a_place_breaks_them(copy: Path) -> None:
+    (copy / PACKAGE / "helpers.py").write_text("")
+    done = lint(copy)
+    assert done.returncode == 1 and "helpers" in done.stdout
