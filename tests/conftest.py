@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from hypothesis import settings
+from tiny import ACTIONS, IMAGE, LEARNER, threads_of
 
 from sb3_dreamer_urlb import DreamerV2, native
 from sb3_dreamer_urlb.agent import Agent
@@ -20,26 +20,9 @@ from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.native import build, planner_ops, product_ops
 from sb3_dreamer_urlb.nn import activation, distributions
 from sb3_dreamer_urlb.spaces.observations import Images
-from sb3_dreamer_urlb.types import Posterior, SequenceBatch
+from sb3_dreamer_urlb.types import SequenceBatch
 from sb3_dreamer_urlb.world_model import convolution, gru
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
-
-IMAGE, ACTIONS = (3, 16, 16), 2
-LEARNER = {
-    "learning_rate": 1e-3,
-    "actor_learning_rate": 1e-3,
-    "critic_learning_rate": 1e-3,
-    "adam_eps": 1e-5,
-    "max_grad_norm": 100.0,
-    "weight_decay": 1e-6,
-    "free_nats": 0.0,
-    "kl_balance": 0.8,
-    "imagination_horizon": 3,
-    "gae_lambda": 0.95,
-    "target_update_interval": 100,
-    "ent_coef": 0.0,
-    "reward_trains_model": True,
-}
 
 
 def pytest_configure() -> None:
@@ -136,27 +119,11 @@ def kernels_of_every_size(kernels: None, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(planner_ops, "fast", lambda: True)
 
 
-@contextmanager
-def threads_of(count: int) -> Iterator[None]:
-    """Inside, torch and kernels of our own use so many threads."""
-    before = th.get_num_threads()
-    th.set_num_threads(count)
-    try:
-        yield
-    finally:
-        th.set_num_threads(before)
-
-
 @pytest.fixture(params=[1, 2])
 def threads(request: pytest.FixtureRequest) -> Iterator[None]:
     """A test for each number of threads."""
     with threads_of(request.param):
         yield
-
-
-def infer(model: WorldModel, batch: SequenceBatch) -> Posterior:
-    """What a world model infers about a batch, with its graph."""
-    return model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)
 
 
 def weights(module: th.nn.Module) -> dict[str, bytes]:

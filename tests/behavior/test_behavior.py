@@ -8,9 +8,10 @@ import copy
 import numpy as np
 import pytest
 import torch as th
-from conftest import LEARNER, infer
 from hypothesis import given
 from hypothesis import strategies as st
+from operator_calls import SYNCHRONISING
+from tiny import LEARNER, infer
 
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
@@ -18,8 +19,6 @@ from sb3_dreamer_urlb.behavior.actor_critic import Actor, Critic, RewardNormaliz
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic import RewardSource
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
-
-SYNCHRONISING = ["item", "cpu", "numpy", "tolist", "__bool__", "__float__", "__int__", "__index__", "__array__"]
 
 
 def _trajectory(horizon, seed):

@@ -7,12 +7,10 @@ saves some lowers it. Counted with a TorchDispatchMode: everything below autogra
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 
 import pytest
 import torch as th
-from test_behavior import SYNCHRONISING
-from torch.utils._python_dispatch import TorchDispatchMode
+from operator_calls import SYNCHRONISING, Calls
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import product_ops
@@ -34,18 +32,6 @@ BOUNDS = {
     ("plan", None, "bfloat16", "native"): 380,
 }
 PLANNER = PlannerConfig(horizon=3, n_samples=8, iterations=2, top_k=4, mixture=0.25)
-
-
-class Calls(TorchDispatchMode):
-    """Counts operator calls by name."""
-
-    def __init__(self):
-        super().__init__()
-        self.counts: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.counts[str(func)] += 1
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
-from conftest import infer
 from fake_envs import CounterEnv
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
+from tiny import infer
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.agent import PlannedAgent

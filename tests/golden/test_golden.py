@@ -2,25 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import golden
 import numpy as np
 import pytest
-from places import TESTS
-
-FILES = ["dreamer_finetune.npz", "lbs_pretrain.npz"]
-OTHERS = [f"{name}_pretrain.npz" for name in ("icm", "plan2explore", "rnd", "apt", "diayn", "aps")]
-
-
-def golden_path(name: str) -> str:
-    """Of a golden file: in ``$SB3_DREAMER_GOLDEN`` if set, else beside the checkout, else the tests' copy."""
-    given = os.environ.get("SB3_DREAMER_GOLDEN")
-    folders = [Path(given)] if given else [TESTS.parent.parent / "shared" / "golden", TESTS / "golden"]
-    found = [folder / name for folder in folders if (folder / name).is_file()]
-    assert found, f"{name} lies in none of {[str(folder) for folder in folders]}"
-    return str(found[0])
+from golden import FILES, OTHERS, golden_path
 
 
 @pytest.fixture

@@ -11,16 +11,19 @@ Sampling is made deterministic from here: the package's two draw functions are r
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from places import TESTS
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
@@ -229,6 +232,19 @@ class Case:
         """The skills that the dreams of one update follow."""
         given = self.data.get(f"update{update}.in.imagination_skill")
         return None if given is None else th.as_tensor(given)
+
+
+FILES = ["dreamer_finetune.npz", "lbs_pretrain.npz"]
+OTHERS = [f"{name}_pretrain.npz" for name in ("icm", "plan2explore", "rnd", "apt", "diayn", "aps")]
+
+
+def golden_path(name: str) -> str:
+    """Of a golden file: in ``$SB3_DREAMER_GOLDEN`` if set, else beside the checkout, else the tests' copy."""
+    given = os.environ.get("SB3_DREAMER_GOLDEN")
+    folders = [Path(given)] if given else [TESTS.parent.parent / "shared" / "golden", TESTS / "golden"]
+    found = [folder / name for folder in folders if (folder / name).is_file()]
+    assert found, f"{name} lies in none of {[str(folder) for folder in folders]}"
+    return str(found[0])
 
 
 def _most_probable(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:

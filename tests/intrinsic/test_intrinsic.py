@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
-from conftest import infer
 from fake_envs import CounterEnv
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny import infer
 
 from sb3_dreamer_urlb import DreamerV2, IntrinsicReward, register_intrinsic_reward
 from sb3_dreamer_urlb.intrinsic import (

@@ -10,19 +10,16 @@ import warnings
 import pytest
 import torch as th
 import torch.nn.functional as F
+from operator_calls import ROUNDING, Calls
 from places import ROOT
 from tape import Tape
-from test_resume import crash
-from test_run_folder import everything, scramble, vec_env
-from test_speed import Calls
+from whole_runs import crash, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import RunCheckpointCallback, native
 from sb3_dreamer_urlb.native import build, ops
 from sb3_dreamer_urlb.nn import activation
 
 SPECIAL = [0.0, -0.0, float("inf"), -float("inf"), float("nan"), 1e-30, -1e-30, -100.0, 100.0]
-#: of ELU relative to max(|x|, 1), and of a product
-ROUNDING = {th.float32: 2e-7, th.bfloat16: 2**-8}
 SHAPES = [(7,), (1, 1), (7, 3), (5, 6), (40, 48), (0, 5), (3, 4, 200), (33, 1030), (2, 4001), (300, 257)]
 IMAGES = [(5, 6, 7, 3), (2, 48, 9, 9), (3, 16, 1, 1), (2, 1, 5, 5)]
 

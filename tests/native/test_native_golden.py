@@ -5,8 +5,8 @@ from __future__ import annotations
 import golden
 import pytest
 import torch as th
-from test_golden import FILES, OTHERS, golden_path
-from test_speed import Calls
+from golden import FILES, OTHERS, golden_path
+from operator_calls import Calls
 
 from sb3_dreamer_urlb.native import product_ops
 from sb3_dreamer_urlb.nn import distributions

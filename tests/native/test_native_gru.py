@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch as th
-from conftest import threads_of
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny import threads_of
 from torch import nn
 
 from sb3_dreamer_urlb import native

@@ -9,8 +9,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
-from test_native import ROUNDING
-from test_speed import Calls
+from operator_calls import ROUNDING, Calls
 from torch import nn
 
 from sb3_dreamer_urlb import native

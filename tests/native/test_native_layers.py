@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch as th
 import torch.nn.functional as F
-from test_native import ROUNDING
-from test_speed import Calls
+from operator_calls import ROUNDING, Calls
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import planner_ops, product_ops

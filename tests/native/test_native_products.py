@@ -10,9 +10,9 @@ import subprocess
 import pytest
 import torch as th
 import torch.nn.functional as F
-from conftest import threads_of
 from hypothesis import example, given
 from hypothesis import strategies as st
+from tiny import threads_of
 
 from sb3_dreamer_urlb.native import build, product_ops
 

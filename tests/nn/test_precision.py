@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch as th
-from conftest import infer
+from tiny import infer
 from torch import nn
 
 from sb3_dreamer_urlb import DreamerV2

@@ -7,11 +7,11 @@ import math
 import pytest
 import torch as th
 import torch.nn.functional as F
-from conftest import threads_of
 from golden import deterministic_draws
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning_forms import METHODS, M, N, agent_and_skill, check_short_products, check_states_and_scores
+from tiny import threads_of
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch as th
-from conftest import threads_of
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tiny import threads_of
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import product_ops, rollout_ops

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from test_replay import ACTION, IMAGE, STORES, Streams, check_rows, held, make_buffer, store  # noqa: F401
-from test_run_folder import everything, scramble, vec_env
+from streams import ACTION, IMAGE, STORES, Streams, check_rows, held, make_buffer
+from whole_runs import everything, scramble, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer, device_store, gathering, stores
@@ -61,7 +61,7 @@ def parts(batch):
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"image": DICT, "skill_size": 4}, {"sampling": "rows", "size": 600}])
-def test_all_stores_hold_and_draw_the_same(store, kwargs):  # noqa: F811
+def test_all_stores_hold_and_draw_the_same(store, kwargs):
     expected, mine = filled(make_buffer(**kwargs)), filled(make_buffer(**kwargs, **store))
     for round_, size in enumerate((40, 40, 40, 7, 40, 40)):
         assert parts(mine.buffer.sample(size)) == parts(expected.buffer.sample(size))

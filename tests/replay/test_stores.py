@@ -18,8 +18,8 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from places import PYTHONPATH
-from test_replay import ACTION, IMAGE, Streams, check_rows, decode, held, make_buffer
-from test_run_folder import SmallDisk, vec_env
+from streams import ACTION, IMAGE, Streams, check_rows, decode, held, make_buffer
+from whole_runs import SmallDisk, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer, stores

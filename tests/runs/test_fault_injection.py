@@ -14,7 +14,7 @@ import gymnasium
 import pytest
 from faults import INJECTIONS
 from places import ROOT, file_of
-from test_run_folder import everything, vec_env
+from whole_runs import everything, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
 from sb3_dreamer_urlb.envs import make_supervised_vec_env

@@ -10,33 +10,14 @@ import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from snapshot_files import change_data, change_header
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, ConvertCallback, EvalCallback
+from stable_baselines3.common.callbacks import CallbackList, CheckpointCallback, ConvertCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from test_run_folder import RepeatingEnv, everything, scramble, vec_env
+from whole_runs import RepeatingEnv, crash, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard
 from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
-
-
-class StopAt(BaseCallback):
-    """Ends ``learn`` as a crash would."""
-
-    def __init__(self, steps):
-        super().__init__()
-        self.steps = steps
-
-    def _on_step(self):
-        if self.num_timesteps >= self.steps:
-            raise ZeroDivisionError
-        return True
-
-
-def crash(model, steps, total, callbacks):
-    with pytest.raises(ZeroDivisionError):
-        model.learn(total, callback=[*callbacks, StopAt(steps)])
-
 
 # -- resume="auto" ---------------------------------------------------------------------------------------------------------
 

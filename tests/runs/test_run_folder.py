@@ -18,59 +18,16 @@ import torch as th
 from fake_envs import CounterEnv
 from places import PYTHONPATH
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from whole_runs import LENGTH, SmallDisk, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
-
-LENGTH = 20
-
-
-class RepeatingEnv(CounterEnv):
-    """Every episode is the same, so that a reset forgets nothing."""
-
-    def reset(self, **kwargs):
-        self.frames = 0
-        return super().reset(**kwargs)
-
-
-def vec_env(n_envs=1, length=LENGTH, **kwargs):
-    return DummyVecEnv([lambda: Monitor(RepeatingEnv(length, **kwargs))] * n_envs)
-
-
-def everything(model) -> dict[str, object]:
-    """All that a run is made of: weights, moments, counters, replay, random states."""
-    buffer = model.replay_buffer
-    episodes = [b"".join(rows.tobytes() for rows in e.rows(0, len(e)).values()) for e in buffer.episodes]
-    return {
-        "weights": {name: value.numpy().tobytes() for name, value in model.policy.state_dict().items()},
-        "moments": {
-            (name, index, key): value.numpy().tobytes()
-            for name, optimizer in model.learner.optimizers().items()
-            for index, state in optimizer.state_dict()["state"].items()
-            for key, value in state.items()
-        },
-        "counters": [model.num_timesteps, model.phase, model.phase_timesteps, model.phase_updates, model._n_updates],
-        "episodes": episodes,
-        "replay": [buffer.evicted, buffer.finished_count, buffer.longest, buffer.finished_rows],
-        "torch": th.get_rng_state().numpy().tobytes(),
-        "numpy": str(np.random.get_state()),  # noqa: NPY002
-        "python": random.getstate(),
-        "sampler": str(buffer.rng.bit_generator.state),
-        "action_space": str(model.action_space.np_random.bit_generator.state),
-    }
 
 
 def close(model):
     """What the end of a process does to a replay on disk."""
     if model.replay_buffer.disk is not None:
         model.replay_buffer.disk.close()
-
-
-def scramble():
-    """What another process would begin with."""
-    th.manual_seed(99), np.random.seed(99), random.seed(99)  # noqa: NPY002
 
 
 LMDB = {"replay_buffer_kwargs": {"store": "lmdb", "path": "replay"}}
@@ -349,27 +306,6 @@ def test_sigint_raises_keyboard_interrupt(tiny_model, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         tiny_model(vec_env()).learn(400, callback=[RunCheckpointCallback(tmp_path), ConvertCallback(interrupt)])
     assert DreamerV2.resume(tmp_path, vec_env()).num_timesteps in (50, 51)
-
-
-class SmallDisk:
-    """A disk of 1 MB, mounted."""
-
-    def __init__(self, folder):
-        self.folder = folder / "disk"
-        self.folder.mkdir()
-        mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(self.folder)]
-        if subprocess.run(mount, capture_output=True).returncode != 0:
-            pytest.skip("only root can mount a small disk")
-
-    def fill(self):
-        free = os.statvfs(self.folder)
-        (self.folder / "filler").write_bytes(b"x" * (free.f_bavail * free.f_bsize - 40_000))
-
-    def free(self):
-        (self.folder / "filler").unlink(missing_ok=True)
-
-    def close(self):
-        subprocess.run(["umount", str(self.folder)], check=True)
 
 
 class SmallFiles:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 from fake_envs import CounterEnv
+from family import VECTOR, family_model, same, short, weights
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, LogEveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
@@ -22,7 +23,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_sb3_family import VECTOR, family_model, same, short, weights
 
 from sb3_dreamer_urlb import DreamerV2
 

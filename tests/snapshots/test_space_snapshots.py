@@ -7,11 +7,11 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 import torch as th
-from conftest import infer
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from snapshot_files import change_data
-from test_spaces import ACTIONS, IMAGE, OBSERVATIONS, VECTOR
+from space_kinds import ACTIONS, IMAGE, OBSERVATIONS, VECTOR
+from tiny import infer
 from torch import nn
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback, SnapshotError

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
-from conftest import infer
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny import infer
 
 from sb3_dreamer_urlb.spaces.observations import Images
 from sb3_dreamer_urlb.types import LatentState, Posterior

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +24,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from snapshot_files import code_events
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from zoo_commands import CHEAP, CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, model_in, train
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
@@ -34,12 +34,10 @@ from sb3_dreamer_urlb.zoo import registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
-CONFIGS = ROOT / "zoo_configs"
 METHODS = ("lbs", "plan2explore", "icm", "rnd", "apt", "diayn", "aps", "random")
 OTHERS = ("scratch", "finetune")
 FILES = [f"{folder}{name}.yml" for folder in ("", "small/") for name in (*METHODS, *OTHERS)]
 VECTORS = "vectors.yml"
-STAND, FLIP = "urlb/walker-stand-v0", "urlb/walker-flip-v0"
 
 
 def entries(file: str) -> dict[str, dict]:
@@ -155,54 +153,12 @@ def test_the_page_names_what_exists():
 
 # -- the commands ----------------------------------------------------------------------------------------------------------
 
-#: a cheap walker under the ids of the benchmark; episodes are short enough to be learnt from at once
-CHEAP = {"length": 20, "action_repeat": 2, "domain": "walker"}
 CHEAP_WALKERS = f"""
 import gymnasium
 import sb3_dreamer_urlb
 for name in ({STAND!r}, {FLIP!r}):
     gymnasium.registry[name].entry_point, gymnasium.registry[name].kwargs = "fake_envs:CounterEnv", {CHEAP!r}
 """
-TINY = [
-    "preset:'tiny'",
-    "callback:[{'sb3_dreamer_urlb.zoo.callbacks.RunSnapshotCallback': dict(frames=[40, 80])},"
-    "{'sb3_dreamer_urlb.PhaseSwitchCallback': dict(pretrain_frames=80)}]",
-]
-TRAIN = ["train", "--algo", "dreamerv2", "--seed", "1", "--device", "cpu", "--verbose", "0"]
-
-
-@pytest.fixture
-def zoo(tmp_path, monkeypatch):
-    """Run a command of the zoo in an empty folder; in this process, which is faster."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["zoo"])
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    for name in (STAND, FLIP):
-        monkeypatch.setitem(gymnasium.registry, name, EnvSpec(name, "fake_envs:CounterEnv", kwargs=CHEAP))
-
-    def run(*arguments: str) -> None:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*not of the same type.*")
-            assert main(arguments) == 0
-
-    return run
-
-
-def train(zoo, env: str = STAND, steps: int = 60, config: str = "lbs", *more: str, params: list[str] | None = None) -> Path:
-    """Train a tiny agent; gives the run's folder."""
-    options = ["--env", env, "-n", str(steps), "-conf", str(CONFIGS / f"{config}.yml"), "--eval-freq", "-1", *more]
-    zoo(*TRAIN, *options, *(["-params", *params] if params else []))
-    return latest_run(env)
-
-
-def latest_run(env: str, logs: Path = Path("logs")) -> Path:
-    return max((logs / "dreamerv2").glob(f"{env.replace('/', '-')}_*"), key=lambda path: int(path.name.split("_")[-1]))
-
-
-def model_in(folder: Path, env: str = STAND) -> DreamerV2:
-    return DreamerV2.load(folder / f"{env.replace('/', '-')}.zip", device="cpu")
 
 
 def in_a_process(arguments: list[str], folder: Path, tests: bool = True) -> str:

@@ -20,8 +20,8 @@ from gymnasium.envs.registration import EnvSpec
 from places import PYTHONPATH
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv
-from test_run_folder import RepeatingEnv, everything
-from test_zoo import CONFIGS, FLIP, ROOT, STAND, TINY, TRAIN, latest_run, model_in, train, zoo  # noqa: F401
+from whole_runs import RepeatingEnv, everything
+from zoo_commands import CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, model_in, train
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.runs.run_folder import RunFolder, steps_done
@@ -50,7 +50,7 @@ gymnasium.registry[{STAND!r}].kwargs = {REPEATING!r}
 
 
 @pytest.fixture
-def repeating(zoo, monkeypatch):  # noqa: F811
+def repeating(zoo, monkeypatch):
     """The zoo, with an environment in which a reset forgets nothing."""
     for name in (STAND, FLIP):
         monkeypatch.setitem(gymnasium.registry, name, EnvSpec(name, SlowEnv, kwargs=REPEATING))

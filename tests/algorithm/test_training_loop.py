@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
-from test_run_folder import RepeatingEnv, everything, scramble
+from whole_runs import RepeatingEnv, everything, scramble
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard, SupervisedVecEnv
