@@ -2,37 +2,32 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from abc import abstractmethod
 from contextlib import ExitStack
 from typing import Any, TypeVar
 
-import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm import checks, training_loop
-from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
-from sb3_dreamer_urlb.envs import env_steps
+from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_attribute
-from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError, check_finite_action
+from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
+from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
-from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
 
-class PhasedAlgorithm(SavingAlgorithm):
+class PhasedAlgorithm(CollectingAlgorithm):
     """An off-policy algorithm that pre-trains with an intrinsic reward and fine-tunes on a task (paper §2, §3).
 
     The base of :class:`~sb3_dreamer_urlb.DreamerV2`, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
@@ -162,22 +157,10 @@ class PhasedAlgorithm(SavingAlgorithm):
         """What the environment tells about itself beyond its spaces."""
         if self.env is None:
             return
+        # Watched from now on, also while others step it.
+        last_touches(self.env)
         self.action_repeat = int(env_attribute(self.env, "action_repeat", 1))
         self.domain = env_attribute(self.env, "domain", None)
-
-    def restart_episodes(self) -> None:
-        """Reset all environments in the middle of ``learn``, because they changed."""
-        assert self.env is not None
-        self.replay_buffer.close_streams()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)
-        self._last_episode_starts = np.ones(self.env.num_envs, bool)
-
-    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
-        """The last observation before normalisation, with channels first as the model sees it."""
-        original = normalizer.get_original_obs()
-        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
@@ -215,73 +198,6 @@ class PhasedAlgorithm(SavingAlgorithm):
         :param keep_critic: whether the critic is kept
         """
 
-    # -- collecting ----------------------------------------------------------------------------------------------------
-
-    def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
-        """Uniformly random actions while this phase's warm-up lasts, float32 (n, A) as the agent chooses them; then None.
-
-        :param learning_starts: agent steps of the warm-up
-        :param n_envs: n
-        """
-        if not phases.PHASES[self.phase].random_warmup or self.phase_timesteps >= learning_starts:
-            return None
-        return make_actions(self.action_space).from_env(np.stack([self.action_space.sample() for _ in range(n_envs)]))
-
-    def _as_executed(self, actions: np.ndarray, action_noise: ActionNoise | None) -> np.ndarray:
-        """The actions that environments will get, float32 (n, A) in [-1, 1], or one-hot; counts their step.
-
-        :param actions: as chosen
-        :param action_noise: added to them
-        :raises ValueError: if one is not finite
-        """
-        n = len(actions)
-        if action_noise is not None:
-            actions = np.clip(actions + action_noise().reshape(n, -1), -1, 1)
-        check_finite_action(actions, "The policy", self.num_timesteps)
-        self.phase_timesteps += n
-        self.phase_frames += n * self.action_repeat
-        return actions.astype(np.float32)
-
-    def forget_step(self) -> None:
-        """The step whose actions were chosen last came to no end: it does not count, and who goes on needs a reset.
-
-        Some of the environments may have made it, and nobody knows what came of it.
-        """
-        self.phase_timesteps -= self.n_envs
-        self.phase_frames -= self.n_envs * self.action_repeat
-        self._last_obs = None
-
-    def _replayed_beside(self) -> dict[str, np.ndarray]:
-        """Further columns of the replay's rows, of the step that was just made, by name: (n, …)."""
-        return {}
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """As SB3's: the replay holds what the environment gave; and a recurrent agent needs to know where episodes begin."""
-        normalizer = self._vec_normalize_env
-        if normalizer is None:
-            self._last_original_obs, original_obs = self._last_obs, new_obs
-        else:
-            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
-        self.env_faults += env_steps.count_faults(infos)
-        # The VecEnv has already begun the next episode: put the true last observation back.
-        next_obs = copy.deepcopy(original_obs)
-        for i in np.flatnonzero(dones):
-            if (last := infos[i].get("terminal_observation")) is not None:
-                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
-        env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        beside = self._replayed_beside()
-        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
-        self._last_obs, self._last_original_obs = new_obs, original_obs
-        self._last_episode_starts = dones.astype(bool)
-
     # -- learning ------------------------------------------------------------------------------------------------------
 
     def learn(
@@ -313,9 +229,7 @@ class PhasedAlgorithm(SavingAlgorithm):
             )
             callbacks.on_training_start(locals(), globals())
             try:
-                training_loop.learn(
-                    self, total_timesteps, callbacks, log_interval, self._update, self.overlap, self.forget_step
-                )
+                training_loop.learn(self, total_timesteps, callbacks, log_interval, self._update, self.overlap)
             except (EnvironmentFaultError, NumericalFaultError) as error:
                 raise type(error)(f"{error} {save_last_good_state(self)}") from error
             callbacks.on_training_end()
@@ -329,6 +243,8 @@ class PhasedAlgorithm(SavingAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if self.env is not None and self._was_touched():
+            self._last_obs = None
         if reset_num_timesteps or self._last_obs is None:
             # The environments are about to be reset.
             self.replay_buffer.close_streams()
@@ -336,9 +252,12 @@ class PhasedAlgorithm(SavingAlgorithm):
         if self.run_folder is not None:
             self.run_folder.restore_normalization(self.get_vec_normalize_env(), self.restart_episodes)
         self._logged_phase = None
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)
         return result
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        # SB3 has just reset the environments; callbacks may touch them.
+        self._begin_episodes()
+        return super()._init_callback(callback, progress_bar)
 
     def _update(self, collected: int, ahead: int) -> None:
         """The updates after, or within the last step of, one rollout.
@@ -365,12 +284,3 @@ class PhasedAlgorithm(SavingAlgorithm):
         self.logger.record("time/phase_frames", self.phase_frames)
         self.logger.record("time/total_frames", self.num_timesteps * self.action_repeat)
         super().dump_logs()
-
-
-def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:
-    """Replace the observation of environment ``i``."""
-    if isinstance(observations, dict):
-        for name, values in observations.items():
-            values[i] = observation[name]
-    else:
-        observations[i] = observation

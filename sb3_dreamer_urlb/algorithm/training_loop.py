@@ -23,17 +23,14 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 class LearningVecEnv(VecEnvWrapper):
     """Environments in whose last step of a rollout the learner works.
 
-    SB3's own rollouts run on it: callbacks, noise, logs and counters are SB3's.
-
     :param venv: the environments
     :param update: what to do in that step
     :param overlap: do it after the actions are sent and before results are waited for; otherwise before they are sent
-    :param lost: told of a step that did not come to its end
     """
 
-    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool, lost: Callable[[], None]):
+    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool):
         super().__init__(venv)
-        self.update, self.overlap, self.lost = update, overlap, lost
+        self.update, self.overlap = update, overlap
         self.left: int | None = None
 
     def begin(self, steps: int | None) -> LearningVecEnv:
@@ -48,14 +45,6 @@ class LearningVecEnv(VecEnvWrapper):
     def reset(self) -> VecEnvObs:
         """As the environments'."""
         return self.venv.reset()
-
-    def step(self, actions: np.ndarray) -> VecEnvStepReturn:
-        """:raises Exception: of the update or the environments"""
-        try:
-            return super().step(actions)
-        except BaseException:
-            self.lost()
-            raise
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions."""
@@ -85,7 +74,6 @@ def learn(
     log_interval: int,
     update: Callable[[int, int], None],
     overlap: bool,
-    lost: Callable[[], None],
 ) -> None:
     """Collect and update until the steps are done, or a callback ends it.
 
@@ -95,7 +83,6 @@ def learn(
     :param log_interval: episodes between two log lines
     :param update: the updates of one rollout; told its agent steps, and how many of them are still under way
     :param overlap: let the environments step meanwhile
-    :param lost: told of a step that did not come to its end
     """
     assert isinstance(model.train_freq, TrainFreq) and model.replay_buffer is not None
     frequency, unit = model.train_freq
@@ -105,7 +92,7 @@ def learn(
         assert model.env is not None
         if env is None or env.venv is not model.env:
             # At first, and when a callback brought other environments.
-            env = LearningVecEnv(model.env, lambda: update(frequency * model.n_envs, model.n_envs), overlap, lost)
+            env = LearningVecEnv(model.env, lambda: update(frequency * model.n_envs, model.n_envs), overlap)
         rollout = model.collect_rollouts(
             env.begin(steps),
             callbacks,

@@ -20,6 +20,7 @@ from typing import Any
 import gymnasium
 
 from sb3_dreamer_urlb.envs.faults import FaultGuard, describe
+from sb3_dreamer_urlb.envs.touches import with_own_observation
 
 OK, RAISED = "ok", "raised"
 
@@ -71,7 +72,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def _step(env: gymnasium.Env, action: Any) -> tuple[Any, ...]:
-    observation, reward, terminated, truncated, info = env.step(action)
+    observation, reward, terminated, truncated, info = with_own_observation(env.step(action))
     reset_info: dict[str, Any] = {}
     info = {**info, "TimeLimit.truncated": truncated and not terminated}
     if terminated or truncated:

@@ -284,7 +284,7 @@ def test_a_callback_that_stops(tiny_model, monkeypatch):
     events = []
     model, mine = events_of(tiny_model, monkeypatch, 100, DiaryCallback(events, last=15))
     assert model.num_timesteps == 15 and events == "start step step end start step".split()
-    assert mine.count("update") == 1 and model.replay_buffer.size() == 2 * 7 + 3  # its step's row is not kept
+    assert mine.count("update") == 1 and model.replay_buffer.size() == 2 * 7 + 4  # its step's row is kept, too
 
 
 def test_schedules_see_the_steps_as_in_sb3(tiny_model, monkeypatch):

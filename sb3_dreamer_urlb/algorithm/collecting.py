@@ -1,0 +1,214 @@
+"""How an algorithm collects: it acts, and keeps what its environments gave before anything else can happen."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import should_collect_more_steps
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
+
+from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
+from sb3_dreamer_urlb.envs import env_steps
+from sb3_dreamer_urlb.envs.faults import check_finite_action
+from sb3_dreamer_urlb.envs.touches import last_touches
+from sb3_dreamer_urlb.spaces.actions import make_actions
+
+
+class CollectingAlgorithm(SavingAlgorithm):
+    """The part of :class:`PhasedAlgorithm` between an agent and its environments."""
+
+    #: agent steps and environment frames in the phase
+    phase_timesteps: int
+    phase_frames: int
+    #: environment frames an agent step
+    action_repeat: int
+    #: faults that environments' guards reported so far
+    env_faults: int
+    #: see ``last_touches``; as of when the model itself last reset or stepped its environments
+    _touches: tuple[int, ...] = ()
+
+    def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
+        """Uniformly random actions while this phase's warm-up lasts, float32 (n, A) as the agent chooses them; then None.
+
+        :param learning_starts: agent steps of the warm-up
+        :param n_envs: n
+        """
+        if not phases.PHASES[self.phase].random_warmup or self.phase_timesteps >= learning_starts:
+            return None
+        return make_actions(self.action_space).from_env(np.stack([self.action_space.sample() for _ in range(n_envs)]))
+
+    def _as_executed(self, actions: np.ndarray, action_noise: ActionNoise | None) -> np.ndarray:
+        """The actions that environments will get, float32 (n, A) in [-1, 1], or one-hot; counts their step.
+
+        :param actions: as chosen
+        :param action_noise: added to them
+        :raises ValueError: if one is not finite
+        """
+        n = len(actions)
+        if action_noise is not None:
+            actions = np.clip(actions + action_noise().reshape(n, -1), -1, 1)
+        check_finite_action(actions, "The policy", self.num_timesteps)
+        self.phase_timesteps += n
+        self.phase_frames += n * self.action_repeat
+        return actions.astype(np.float32)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """As SB3's, but a step is kept before anybody hears of it, and only where the environment stands as it was left.
+
+        So whatever callbacks do (stop, raise, evaluate in these very environments), rows of an episode followed each other.
+        The rollout also ends where a callback brought another environment or replay.
+
+        :param env: the model's
+        :param callback: told as SB3 tells it, with the same names in ``locals``
+        :param train_freq: length of the rollout
+        :param replay_buffer: the model's
+        :param action_noise: added to actions
+        :param learning_starts: agent steps of the phase until the policy acts
+        :param log_interval: episodes between two log lines
+        :return: steps and episodes of the rollout
+        """
+        assert self.env is not None and (env.num_envs == 1 or train_freq.unit == TrainFrequencyUnit.STEP), (
+            "You must use only one env when doing episodic training."
+        )
+        self.policy.set_training_mode(False)
+        num_collected_steps, num_collected_episodes = 0, 0
+        continue_training = True
+        callback.on_rollout_start()
+        while should_collect_more_steps(train_freq, num_collected_steps, num_collected_episodes):
+            if self.env.unwrapped is not env.unwrapped or self.replay_buffer is not replay_buffer:
+                break
+            if self._last_obs is None or self._was_touched():
+                self.restart_episodes()
+            with self._whole_step():
+                actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
+                new_obs, rewards, dones, infos = env.step(actions)
+                self._touches = last_touches(env)
+                self.num_timesteps += env.num_envs
+                self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+            self._count_episodes(infos, dones, action_noise)
+            num_collected_steps += 1
+            callback.update_locals(locals())
+            if not callback.on_step():
+                continue_training = False
+                break
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._on_step()
+            ended = int(dones.sum())
+            num_collected_episodes += ended
+            if log_interval is not None and self._episode_num % log_interval < ended:
+                self.dump_logs()
+        if continue_training:
+            callback.on_rollout_end()
+        return RolloutReturn(num_collected_steps * env.num_envs, num_collected_episodes, continue_training)
+
+    def _count_episodes(self, infos: list[dict[str, Any]], dones: np.ndarray, action_noise: ActionNoise | None) -> None:
+        """The episodes of environments that are done are over."""
+        self._update_info_buffer(infos, dones)
+        for i in np.flatnonzero(dones).tolist():
+            self._episode_num += 1
+            if isinstance(action_noise, VectorizedActionNoise):
+                action_noise.reset(indices=[i])
+            elif action_noise is not None:
+                action_noise.reset()
+
+    @contextmanager
+    def _whole_step(self) -> Iterator[None]:
+        """A step that does not come to its end does not count, and who goes on needs a reset.
+
+        Some of the environments may have made it, and nobody knows what came of it.
+        """
+        before = self.num_timesteps, self.phase_timesteps, self.phase_frames
+        try:
+            yield
+        except BaseException:
+            self.num_timesteps, self.phase_timesteps, self.phase_frames = before
+            self._last_obs = None
+            raise
+
+    def _was_touched(self) -> bool:
+        """Whether somebody else reset or stepped the environments since the model did, or they are others."""
+        assert self.env is not None
+        return last_touches(self.env) != self._touches
+
+    def _replayed_beside(self) -> dict[str, np.ndarray]:
+        """Further columns of the replay's rows, of the step that was just made, by name: (n, …)."""
+        return {}
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """As SB3's: the replay holds what the environment gave; and a recurrent agent needs to know where episodes begin."""
+        normalizer = self._vec_normalize_env
+        if normalizer is None:
+            self._last_original_obs, original_obs = self._last_obs, new_obs
+        else:
+            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
+        self.env_faults += env_steps.count_faults(infos)
+        # The VecEnv has already begun the next episode: put the true last observation back.
+        next_obs = copy.deepcopy(original_obs)
+        for i in np.flatnonzero(dones):
+            if (last := infos[i].get("terminal_observation")) is not None:
+                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
+        env_steps.check_finite(next_obs, reward, self.num_timesteps)
+        beside = self._replayed_beside()
+        replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
+        # Environments may write the next observation into the same arrays.
+        self._last_obs, self._last_original_obs = copy.deepcopy(new_obs), copy.deepcopy(original_obs)
+        self._last_episode_starts = dones.astype(bool)
+
+    # -- episodes ------------------------------------------------------------------------------------------------------
+
+    def restart_episodes(self) -> None:
+        """Reset all environments in the middle of ``learn``, because they changed."""
+        assert self.env is not None
+        self.replay_buffer.close_streams()
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.env.num_envs, bool)
+        self._begin_episodes()
+
+    def _begin_episodes(self) -> None:
+        """The environments were just reset, or stand as they were left."""
+        assert self.env is not None
+        self._touches = last_touches(self.env)
+        # Environments may write the next observation into the same arrays.
+        self._last_obs = copy.deepcopy(self._last_obs)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._original_obs(self._vec_normalize_env)
+
+    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
+        """The last observation before normalisation, with channels first as the model sees it."""
+        original = normalizer.get_original_obs()
+        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
+
+
+def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:
+    """Replace the observation of environment ``i``."""
+    if isinstance(observations, dict):
+        for name, values in observations.items():
+            values[i] = observation[name]
+    else:
+        observations[i] = observation
