@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
 import os
@@ -21,6 +22,7 @@ import gymnasium
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import get_device
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2, native
@@ -50,7 +52,10 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     """Options that every benchmark takes."""
     options = argparse.ArgumentParser(description=description)
     options.add_argument("--preset", default="paper", help="size of the model (default: paper)")
-    options.add_argument("--precision", nargs="+", default=["float32", "bfloat16"], help="formats of products to compare")
+    formats = ["float32", *(["bfloat16"] if multiplies_well(th.bfloat16, get_device("auto")) else [])]
+    options.add_argument(
+        "--precision", nargs="+", default=formats, help="formats of products to compare (default here: %(default)s)"
+    )
     options.add_argument(
         "--compile", nargs="+", default=["auto"], help="whose kernels, to compare: auto, native, eager (default: auto)"
     )
@@ -88,6 +93,7 @@ class Quick(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *_: object) -> None:
         namespace.quick, namespace.preset, namespace.repeat = True, "tiny", 1
+        Product.resize(64)
 
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -147,17 +153,41 @@ def _prepacked(x: Sequence[int], *_: Any, out_shape: Sequence[int], **__: Any) -
     return 2 * math.prod(x) * out_shape[-1]
 
 
-class Product:
-    """A big matrix product, 4096³: the arithmetic that a machine can do at best, in one format.
+@functools.cache
+def multiplies_well(dtype: th.dtype, device: th.device) -> bool:
+    """Whether a small product takes less than four times what it takes in float32; it takes hundreds of times that where the
+    processor has no instructions for the format."""
 
-    :param dtype: format
+    def quickest(its: th.dtype) -> float:
+        left, right = (th.ones(PROBE, PROBE, device=device).to(its) for _ in range(2))
+        return min(seconds(lambda: left @ right, 5, device))
+
+    return dtype == th.float32 or quickest(dtype) < 4 * quickest(th.float32)
+
+
+#: rows and columns of the product that tells whether the machine multiplies a format well
+PROBE = 256
+
+
+class Product:
+    """A big matrix product, 4096³ unless ``--quick``: the arithmetic that a machine can do at best.
+
+    :param dtype: wanted format; where the machine does not multiply it well, the product is float32's, see ``name``
     :param device: where
     """
 
     SIZE = 4096
     TFLOP = 2 * SIZE**3 / 1e12
 
+    @classmethod
+    def resize(cls, size: int) -> None:
+        """Let all that follow have so many rows and columns."""
+        cls.SIZE, cls.TFLOP = size, 2 * size**3 / 1e12
+
     def __init__(self, dtype: th.dtype, device: th.device):
+        dtype = dtype if multiplies_well(dtype, device) else th.float32
+        #: of its row in a table
+        self.name = f"product of {self.SIZE}³ in {str(dtype).removeprefix('torch.')}"
         self.left, self.right = (th.randn(self.SIZE, self.SIZE, device=device).to(dtype) for _ in range(2))
 
     def __call__(self) -> th.Tensor:

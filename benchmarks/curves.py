@@ -134,14 +134,14 @@ def main() -> None:
     work: dict[str, Callable[[], object]] = {}
     counted, floors = {}, {}
     for curve, points in chosen.items():
-        product = f"product of 4096³ in {str(curves.dtype(curve)).removeprefix('torch.')}"
-        work.setdefault(product, Product(curves.dtype(curve), device))
+        product = Product(curves.dtype(curve), device)
+        work.setdefault(product.name, product)
         for point in points:
             row = f"{curve}: {point}"
             work[row] = curves.work(curve, point)
             counted[row] = tflop(work[row])
             if counted[row]:
-                floors[row] = Floor(product, counted[row] / Product.TFLOP)
+                floors[row] = Floor(product.name, counted[row] / Product.TFLOP)
     times = interleaved(work, options, device)
     notes = [f"Updates of the imagination horizon's curve have {curves.batch} sequences a batch."]
     report("curves", times, floors, options, device, notes=notes, tflop=counted)

@@ -106,8 +106,10 @@ class Windows(BaseCallback):
             self.peak = peak_rss()
             self.bare = BareLoop(self.options.domain)
             self.bare.reset()
-            formats = {self.model.learner.dtype, th.bfloat16}
-            self.products = {str(dtype): Product(dtype, self.model.device) for dtype in formats}
+            formats = {UPDATE: self.model.learner.dtype, PLANNING: th.bfloat16}
+            products = {part: Product(dtype, self.model.device) for part, dtype in formats.items()}
+            self.formats = {part: big.name for part, big in products.items()}
+            self.products = {big.name: big for big in products.values()}
         floors: dict[str, Callable[[], object]] = {ENV: self.bare.step, **self.products}
         for name, work in floors.items():
             warm_up = 0 if name in self.floors else 1
@@ -155,7 +157,7 @@ def run_phase(options: argparse.Namespace) -> dict[str, Any]:
         "reset": min(seconds(model.env.reset, 2, model.device, options.clock, warm_up=0)),
         "memory": {"before": windows.before, "peak": windows.peak, "row": model.replay_buffer.row_bytes()},
         "steps": frequency * model.n_envs,
-        "dtype": str(model.learner.dtype),
+        "products": windows.formats,
         "own": own,
     }
 
@@ -178,6 +180,7 @@ def in_process(phase: str, precision: str, snapshot: str, options: argparse.Name
     for name in ("preset", "repeat", "threads", "clock", "device", "domain", "environments"):
         if getattr(options, name) is not None:
             words += [f"--{name}", str(getattr(options, name))]
+    words = ["--quick", *words] if options.quick else words
     done = subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.PIPE, text=True)
     result = json.loads(done.stdout.splitlines()[-1])
     assert isinstance(result, dict)
@@ -197,8 +200,8 @@ def summary(phase: str, found: dict[str, Any], episode: int) -> dict[str, Any]:
     product = {name: time / Product.TFLOP for name, time in floor.items() if name != ENV}
     floors = {
         ENV: floor[ENV],
-        UPDATE: found["tflop"][UPDATE] * product[found["dtype"]] / found["steps"],
-        PLANNING: found["tflop"][PLANNING] * product["torch.bfloat16"],
+        UPDATE: found["tflop"][UPDATE] * product[found["products"][UPDATE]] / found["steps"],
+        PLANNING: found["tflop"][PLANNING] * product[found["products"][PLANNING]],
     }
     own, total = found["own"], sum(parts.values())
     agent_steps = PHASES[phase] / REPEAT
@@ -222,7 +225,7 @@ def summary(phase: str, found: dict[str, Any], episode: int) -> dict[str, Any]:
         "peak GB": memory["peak"] / GB,
         "peak GB with a full replay": (memory["peak"] + rows * memory["row"]) / GB,
         "GB before the first update": memory["before"] / GB,
-        "products": found["dtype"],
+        "products": found["products"],
         **found,
     }
 

@@ -25,7 +25,9 @@ import torch  # noqa: F401
 FOLDER = Path(__file__).parent
 COMPILERS = ("c++", "g++", "clang++")
 # No -ffast-math: what is not a number must stay so.
-FLAGS = ("-O3", "-march=native", "-fopenmp", "-fPIC", "-fvisibility=hidden", "-std=c++17")
+FLAGS = ("-O3", "-fopenmp", "-fPIC", "-fvisibility=hidden", "-std=c++17")
+#: environment variable: the processor to compile for, as the compiler's -march has it; this one's if it is not set
+MARCH = "SB3_DREAMER_URLB_MARCH"
 #: seconds that the compiler may take
 TIME_LIMIT = 120.0
 
@@ -89,14 +91,18 @@ def cache_folder() -> Path | None:
     return folder if status.st_uid == os.getuid() and not status.st_mode & 0o022 else None
 
 
+def _march() -> str:
+    return f"-march={os.environ.get(MARCH) or 'native'}"
+
+
 def _cached_file(name: str) -> Path | None:
     folder = cache_folder()
     return None if folder is None else folder / name
 
 
 def _fingerprint(compiler: list[str]) -> str:
-    macros = _run([*compiler, "-march=native", "-dM", "-E", "-x", "c++", os.devnull])
-    digest = hashlib.sha256(repr((FLAGS, compiler[1:])).encode() + macros)
+    macros = _run([*compiler, _march(), "-dM", "-E", "-x", "c++", os.devnull])
+    digest = hashlib.sha256(repr((FLAGS, compiler[1:], _march())).encode() + macros)
     for path in sorted([*FOLDER.glob("*.cpp"), *FOLDER.glob("*.h")]):
         source = path.read_bytes()
         digest.update(f"{path.name} {len(source)}\n".encode() + source)
@@ -109,10 +115,11 @@ def _compile(compiler: list[str], file: Path) -> None:
     if not sources:
         raise NativeUnavailable(f"no C++ source in {FOLDER}")
     objects = [str(file.with_name(f"{source.stem}.o")) for source in sources]
-    commands = [[*compiler, *FLAGS, "-c", "-o", *pair] for pair in zip(objects, map(str, sources), strict=True)]
+    flags = (*FLAGS, _march())
+    commands = [[*compiler, *flags, "-c", "-o", *pair] for pair in zip(objects, map(str, sources), strict=True)]
     with ThreadPoolExecutor() as pool:
         list(pool.map(_run, commands))
-    _run([*compiler, *FLAGS, "-shared", "-o", str(file), *objects])
+    _run([*compiler, *flags, "-shared", "-o", str(file), *objects])
 
 
 def _run(command: list[str]) -> bytes:

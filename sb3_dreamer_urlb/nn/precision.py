@@ -8,6 +8,7 @@ state, layer norm, probabilities, draws, losses and returns stay float32. Every 
 from __future__ import annotations
 
 import functools
+import warnings
 
 import torch as th
 
@@ -26,12 +27,15 @@ def choose(precision: str, part: str, device: th.device | str, feature_size: int
     :param part: a key of ``AUTO_FEATURE_SIZE``
     :param device: where it runs
     :param feature_size: F, width of the model's features
-    :return: ``torch.float32`` or ``torch.bfloat16``
+    :return: ``torch.float32`` or ``torch.bfloat16``; the latter warns, once a process, where the processor is slow at it
     """
-    if precision != "auto":
-        return {"float32": th.float32, "bfloat16": th.bfloat16}[precision]
-    fast = th.device(device).type == "cpu" and _cpu_has_amx() and feature_size >= AUTO_FEATURE_SIZE[part]
-    return th.bfloat16 if fast else th.float32
+    on_cpu = th.device(device).type == "cpu"
+    if precision == "auto":
+        fast = on_cpu and _cpu_has_amx() and cpu_multiplies_short() and feature_size >= AUTO_FEATURE_SIZE[part]
+        return th.bfloat16 if fast else th.float32
+    if precision == "bfloat16" and on_cpu and not cpu_multiplies_short():
+        _warn_of_slow_products()
+    return {"float32": th.float32, "bfloat16": th.bfloat16}[precision]
 
 
 def products(device: th.device | str, dtype: th.dtype) -> th.autocast:
@@ -55,6 +59,37 @@ def short(x: th.Tensor) -> th.Tensor:
 def full(x: th.Tensor) -> th.Tensor:
     """Back to float32 behind a product; anything but bfloat16 passes as it is."""
     return x.float() if x.dtype == th.bfloat16 else x
+
+
+def multiply(left: th.Tensor, right: th.Tensor) -> th.Tensor:
+    """left · right for operands in one format, which the result has, too; in float32 where the CPU is slow at theirs."""
+    if left.dtype == th.bfloat16 and left.device.type == "cpu" and not cpu_multiplies_short():
+        return (left.float() @ right.float()).to(left.dtype)
+    return left @ right
+
+
+@functools.cache
+def cpu_multiplies_short() -> bool:
+    """Whether torch multiplies bfloat16 numbers with instructions that this processor has for them.
+
+    Whoever multiplies is asked, oneDNN: it knows what the processor can, and what ``ONEDNN_MAX_CPU_ISA`` hides. Elsewhere
+    torch has loops of its own, at a hundredth of the speed of float32.
+    """
+    if not (th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight")):
+        return False
+    try:
+        th.ops.mkldnn._reorder_linear_weight(th.zeros(1, 1, dtype=th.bfloat16), None)
+    except RuntimeError:
+        return False
+    return True
+
+
+@functools.cache
+def _warn_of_slow_products() -> None:
+    warnings.warn(
+        'precision="bfloat16" is slow here: this processor has no instructions for bfloat16 products, which take about a '
+        'hundred times as long as float32 ones; precision="auto" takes whichever is faster'
+    )
 
 
 @functools.cache

@@ -82,7 +82,7 @@ def test_ratios_come_first(run, name, tmp_path):
 def test_update_has_its_floor_at_paper_size(run, load, monkeypatch):
     monkeypatch.setitem(PRESETS, "paper", PRESETS["tiny"])
     _, result = run("update", "--preset", "paper", "--precision", "float32", "--phases", "fine-tuning")
-    measured, product = (min(result["seconds"][row]) for row in ("fine-tuning, float32", "product of 4096³ in float32"))
+    measured, product = (min(result["seconds"][row]) for row in ("fine-tuning, float32", "product of 64³ in float32"))
     assert result["ratios"]["fine-tuning, float32"] == pytest.approx(measured / (product * 2.4 / (2 * 64**3 / 1e12)))
 
 
@@ -133,6 +133,26 @@ def test_arithmetic_is_counted_whoever_computes_it(load, kernels_of_every_size):
     prepacked = PrepackedLinear(layer.weight, layer.bias, th.float32)
     for its in (work, lambda: prepacked(th.ones(30, 40)), lambda: prepacked(th.ones(30, 40), th.ones(30, 50))):
         assert load("common").tflop(its) == 2 * 30 * 40 * 50 / 1e12
+
+
+def test_the_floor_is_a_format_that_the_machine_multiplies(load, monkeypatch, capsys):
+    common, device = load("common"), th.device("cpu")
+    monkeypatch.setattr(common.Product, "SIZE", 64)
+    for well, floor in ((True, "bfloat16"), (False, "float32")):
+        monkeypatch.setattr(common, "multiplies_well", lambda dtype, device, well=well: well or dtype == th.float32)
+        product = common.Product(th.bfloat16, device)
+        assert product.name == f"product of 64³ in {floor}" and str(product().dtype) == f"torch.{floor}"
+        assert common.parser("").parse_args([]).precision == ["float32", "bfloat16"][: 1 + well]
+
+
+def test_how_well_is_measured(load, monkeypatch):
+    common = load("common")
+    speed = {th.float32: 1.0, th.bfloat16: 3.0, th.float16: 5.0}
+    monkeypatch.setattr(common, "seconds", lambda work, *_: [9.0, speed[work().dtype]])
+    common.multiplies_well.cache_clear()
+    found = {dtype: common.multiplies_well(dtype, th.device("cpu")) for dtype in speed}
+    common.multiplies_well.cache_clear()
+    assert found == {th.float32: True, th.bfloat16: True, th.float16: False}
 
 
 def test_methods(run, load, monkeypatch):
@@ -193,12 +213,12 @@ def test_projection(load):
     window = {"environment": 5.0, "acting": 0.5, "planning": 10.0, "update": 2.0, "replay sample": 0.5, "replay add": 0.0}
     found = {
         "windows": [dict.fromkeys(window, 9.0), window],
-        "floors": {"environment": [0.5, 0.4], "torch.float32": [1.0], "torch.bfloat16": [0.5]},
+        "floors": {"environment": [0.5, 0.4], "float32": [1.0], "bfloat16": [0.5]},
         "tflop": {"update": 0.5 * end_to_end.Product.TFLOP, "planning": end_to_end.Product.TFLOP},
         "reset": 3.0,
         "memory": {"before": 1e9, "peak": 2e9, "row": 1e4},
         "steps": 5,
-        "dtype": "torch.float32",
+        "products": {"update": "float32", "planning": "bfloat16"},
         "own": {"learning_starts": 2000, "planner_delay": 500, "buffer_size": 1000, "train_freq": 5},
     }
     result = end_to_end.summary("fine-tuning", found, 500)

@@ -22,8 +22,13 @@ from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, Patc
 
 @pytest.fixture
 def amx(monkeypatch):
-    """A function that says whether the CPU has AMX tiles."""
-    return lambda has: monkeypatch.setattr(precision, "_cpu_has_amx", lambda: has)
+    """A function that says whether the CPU has AMX tiles, and torch uses them."""
+
+    def say(has):
+        monkeypatch.setattr(precision, "_cpu_has_amx", lambda: has)
+        monkeypatch.setattr(precision, "cpu_multiplies_short", lambda: True)
+
+    return say
 
 
 def test_auto_asks_for_hardware_and_size(amx):

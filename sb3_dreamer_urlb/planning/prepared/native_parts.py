@@ -11,6 +11,7 @@ from sb3_dreamer_urlb.native import planner_ops, rollout_ops
 from sb3_dreamer_urlb.native.planner_ops import rows_format, whole_lines
 from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.nn.precision import multiply
 from sb3_dreamer_urlb.planning.prepared.chain import Chain
 from sb3_dreamer_urlb.planning.prepared.parts import SampledState, Visited
 from sb3_dreamer_urlb.types import LatentState
@@ -99,7 +100,7 @@ class NativeDynamics:
         """Computed once: each iteration of a plan begins with the same states."""
         if self._start is not state:
             rows = self.rows[:, : self.hidden_size].to(self.dtype)
-            part = state.stoch.to(self.dtype) @ rows
+            part = multiply(state.stoch.to(self.dtype), rows)
             inputs, short = self._inputs(state.deter)
             short.copy_(state.deter)
             self._start, self._parts = state, (part, inputs)

@@ -16,7 +16,7 @@ from torch import nn
 from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.nn.activation import elu_
 from sb3_dreamer_urlb.nn.nets import MLP
-from sb3_dreamer_urlb.nn.precision import full
+from sb3_dreamer_urlb.nn.precision import full, multiply
 from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
@@ -125,7 +125,7 @@ class Dynamics:
     def _start_part(self, state: LatentState) -> th.Tensor:
         """Computed once: each iteration of a plan begins with the same states."""
         if self._start is not state:
-            self._start, self._part = state, state.stoch.to(self.dtype) @ self.rows
+            self._start, self._part = state, multiply(state.stoch.to(self.dtype), self.rows)
         return self._part
 
     def _recur(self, inputs: th.Tensor, deter: th.Tensor) -> th.Tensor:
@@ -137,7 +137,7 @@ class Dynamics:
     def _draw(self, short: th.Tensor, generator: th.Generator | None) -> th.Tensor:
         """Classes lie outermost in memory: what is done for each class runs over all states at once."""
         hidden = elu_(self.hidden(short)).T
-        logits = (self.logits_weight @ hidden).view(*self.shape, -1)  # (S, K, n)
+        logits = multiply(self.logits_weight, hidden).view(*self.shape, -1)  # (S, K, n)
         drawn = []
         for block, bias in zip(logits.split(BLOCK), self.logits_bias.split(BLOCK), strict=True):
             probs = block.float().add_(bias).clamp_(max=MAX_LOGIT).exp_().movedim(-1, 0)

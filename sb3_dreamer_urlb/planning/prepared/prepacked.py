@@ -6,12 +6,14 @@ import torch as th
 import torch.nn.functional as F
 
 from sb3_dreamer_urlb.nn.activation import elu_
+from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 
 
 class PrepackedLinear:
     """x · weightᵀ + bias. oneDNN orders weights its own way before each product; here it does so once.
 
-    The two operators are those that torch.compile emits on CPUs; where torch lacks them this is an ordinary product.
+    The two operators are those that torch.compile emits on CPUs; where torch lacks them this is an ordinary product. Where the
+    processor cannot multiply bfloat16 numbers, they are multiplied as float32 ones, and the result is rounded.
 
     :param weight: float (outputs, inputs)
     :param bias: float (outputs,), None for none
@@ -19,8 +21,11 @@ class PrepackedLinear:
     """
 
     def __init__(self, weight: th.Tensor, bias: th.Tensor | None, dtype: th.dtype):
-        self.weight = weight.detach().to(dtype)
-        self.bias = None if bias is None else bias.detach().to(dtype)
+        self.dtype = dtype
+        #: of the product; other than that of operands and result only where the processor cannot
+        self.inner = th.float32 if dtype == th.bfloat16 and not cpu_multiplies_short() else dtype
+        self.weight = weight.detach().to(dtype).to(self.inner)
+        self.bias = None if bias is None else bias.detach().to(dtype).to(self.inner)
         self.packed: th.Tensor | None = None
         if th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight"):
             self.packed = th.ops.mkldnn._reorder_linear_weight(self.weight.contiguous(), None)
@@ -32,7 +37,7 @@ class PrepackedLinear:
         :param elu: whether to apply ELU to the result
         :return: (n, outputs), in the format of products
         """
-        y = self._product(x, plus)
+        y = self._product(x.to(self.inner), None if plus is None else plus.to(self.inner)).to(self.dtype)
         return elu_(y) if elu else y
 
     def _product(self, x: th.Tensor, plus: th.Tensor | None) -> th.Tensor:

@@ -1,0 +1,75 @@
+"""A processor with AVX2 and nothing newer, as most laptops have: this one with the rest hidden, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import warnings
+
+import every_combination
+import pytest
+import torch as th
+from places import HELPERS, PYTHONPATH
+
+from sb3_dreamer_urlb.nn import precision
+from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
+
+pytestmark = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="AVX2 is x86's")
+
+
+def masked(*command):
+    environment = {**os.environ, **every_combination.MASKED, "PYTHONPATH": PYTHONPATH, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_every_combination_runs(kernels):
+    found = json.loads(masked(HELPERS / "every_combination.py"))
+    assert found["torch"] == "AVX2" and not found["short"] and not found["lanes"] and not found["tiles"]
+    assert found["native"]  # ours are compiled for it, too
+    assert not found["faults"], "\n".join(found["faults"])
+    slow = [warning for warning in found["warnings"] if "is slow here" in warning]
+    assert len(slow) == 1 and "'bfloat16', 'auto'" in slow[0] and 'precision="auto"' in slow[0]
+    assert all("cuda_graphs" in warning for warning in found["warnings"] if warning not in slow)
+
+
+def test_auto_never_takes_what_is_slow_there():
+    code = "from sb3_dreamer_urlb.nn import precision as p; print({p.choose('auto', part, 'cpu', 10**6) for part in %r})"
+    assert masked("-c", code % list(precision.AUTO_FEATURE_SIZE)) == "{torch.float32}\n"
+
+
+@pytest.fixture
+def slow_at_bfloat16(monkeypatch):
+    """In this process, the same question answered with no."""
+    for module in ("nn.precision", "planning.prepared.prepacked"):
+        monkeypatch.setattr(f"sb3_dreamer_urlb.{module}.cpu_multiplies_short", lambda: False)
+    precision._warn_of_slow_products.cache_clear()
+    yield
+    precision._warn_of_slow_products.cache_clear()
+
+
+def test_asking_for_it_warns_once_and_on_a_gpu_not_at_all(slow_at_bfloat16):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert precision.choose("bfloat16", "update", "cuda", 8) == th.bfloat16
+        assert not caught
+        assert (
+            precision.choose("bfloat16", "update", "cpu", 8)
+            == precision.choose("bfloat16", "planner", "cpu", 8)
+            == th.bfloat16
+        )
+    assert len(caught) == 1 and "slow here" in str(caught[0].message)
+
+
+def test_planners_products_are_rounded_alike_whoever_multiplies(slow_at_bfloat16, seeded):
+    weight, bias, plus, x = th.randn(30, 40), th.randn(30), th.randn(7, 30).bfloat16(), th.randn(7, 40).bfloat16()
+    layer = PrepackedLinear(weight, bias, th.bfloat16)
+    expected = x.double() @ weight.bfloat16().double().T + bias.bfloat16().double()
+    assert th.equal(layer(x), expected.float().bfloat16())
+    assert layer(x, plus).dtype == th.bfloat16
+    assert th.allclose(layer(x, plus).double(), expected + plus.double(), rtol=2**-8, atol=1e-5)
+    assert th.equal(precision.multiply(x, weight.bfloat16().T), (x.double() @ weight.bfloat16().double().T).float().bfloat16())
