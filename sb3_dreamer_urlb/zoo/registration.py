@@ -26,14 +26,14 @@ from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING
-from sb3_dreamer_urlb.zoo import resuming
+from sb3_dreamer_urlb.zoo import configs, resuming
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
 
 #: rl_zoo3's name of the algorithm; the hub looks for the class's name in lower case
 ALGORITHM = "dreamerv2"
-#: what ``train`` reads without ``-conf``, in a checkout of the repository: the first of these that knows the environment
-DEFAULT_CONFIGS = [Path(__file__).parents[2] / "zoo_configs" / name for name in ("lbs.yml", "vectors.yml")]
+#: what ``train`` reads without ``-conf``: the first of these that knows the environment
+DEFAULT_CONFIGS = [configs.folder() / name for name in ("lbs.yml", "vectors.yml")]
 
 
 def register() -> None:
@@ -83,6 +83,8 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     else:
         if getattr(options, "conf_file", manager.config) is None:
             manager.config = str(_default_config(manager.env_name.gym_id))
+        else:
+            manager.config = configs.resolve(manager.config)
         hyperparams, config = original(manager)
     resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
     checkpoint = hyperparams.pop("checkpoint", True)
@@ -103,7 +105,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
 def _default_config(env_id: str) -> Path:
     there = [path for path in DEFAULT_CONFIGS if path.is_file()]
     if not there:
-        raise ValueError("Name a configuration with -conf; this package's repository has some in zoo_configs/.")
+        raise ValueError(f"Name a configuration with -conf: {configs.folder()} is not there.")
     knowing = [path for path in there if env_id in yaml.safe_load(path.read_text())]
     # Of an environment that none of them knows, rl_zoo3 complains itself.
     return (knowing or there)[0]

@@ -13,7 +13,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from PIL import Image
 
-from sb3_dreamer_urlb import DreamerV2, __main__
+from sb3_dreamer_urlb import DreamerV2, __main__, __version__
 from sb3_dreamer_urlb.cli import demo
 from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
 from sb3_dreamer_urlb.evaluation import figures
@@ -115,6 +115,12 @@ def test_a_wrong_command_line_is_refused(arguments, capsys):
     with pytest.raises(SystemExit) as error:
         __main__.main(arguments)
     assert error.value.code == 2 and "usage: sb3-dreamer-urlb" in capsys.readouterr().err
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit, match=r"^0$"):
+        __main__.main(["--version"])
+    assert capsys.readouterr().out == f"sb3_dreamer_urlb {__version__}\n"
 
 
 def test_missing_plots_are_told_before_any_training(fake_walker, tmp_path, monkeypatch, capsys):
