@@ -10,6 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.version import __version__
+
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
 MODULES = ("evaluate",)
 
@@ -21,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit status
     """
     parser = argparse.ArgumentParser(prog="sb3-dreamer-urlb", description=__doc__)
-    parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {_version()}")
+    parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
     demo = commands.add_parser("demo", help="pre-train and fine-tune a small agent on walker pixels, and show the result")
     demo.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_output)")
@@ -57,11 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2
-
-
-def _version() -> str:
-    """Without the heavy imports of the package, of which this module is a part."""
-    return (Path(__file__).parent / "version.txt").read_text().strip()
 
 
 def _demo(options: dict[str, Any]) -> int:
