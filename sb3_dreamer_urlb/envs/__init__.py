@@ -1,7 +1,8 @@
-"""The benchmark's environments, from pixels. Importing this imports neither dm_control nor OpenGL.
+"""The benchmark's environments, from pixels or from states. Importing this imports neither dm_control nor OpenGL.
 
 ``registration`` names the tasks and their gymnasium ids; ``dmc`` builds an environment from a name; ``urlb_tasks`` and
-``jaco`` hold the tasks; ``pixel_env`` is the environment an agent sees, ``options`` what one can choose about it;
+``jaco`` hold the tasks; ``control_env`` is the environment an agent acts in, ``pixel_env`` and ``state_env``
+what it sees of it, ``options`` what one can choose about it;
 ``rendering`` finds an OpenGL backend; ``faults`` goes on where an environment raises,
 ``supervisor`` where its process (``worker``) dies or hangs.
 """
@@ -12,7 +13,7 @@ from sb3_dreamer_urlb.envs.dmc import make_control_env, make_dmc_env, make_urlb_
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError, FaultGuard
 from sb3_dreamer_urlb.envs.options import PixelOptions
 from sb3_dreamer_urlb.envs.registration import DOMAINS, PRIMAL_TASK, URLB_TASKS, env_id, register_envs
-from sb3_dreamer_urlb.envs.rendering import RenderingBackendError, load_renderer
+from sb3_dreamer_urlb.envs.rendering import RenderingBackendError, load_physics, load_renderer
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv, make_supervised_vec_env
@@ -27,6 +28,7 @@ __all__ = [
     "RenderingBackendError",
     "SupervisedVecEnv",
     "env_id",
+    "load_physics",
     "load_renderer",
     "make_control_env",
     "make_dmc_env",

@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from sb3_dreamer_urlb.envs.options import PixelOptions
+from sb3_dreamer_urlb.envs.options import PixelOptions, refuse_unknown
 from sb3_dreamer_urlb.envs.registration import URLB_TASKS, check_urlb_task
-from sb3_dreamer_urlb.envs.rendering import load_renderer
+from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
 
 if TYPE_CHECKING:
     from dm_control import composer
     from dm_control.rl import control
+
+    from sb3_dreamer_urlb.envs.control_env import ControlEnv
 
 
 def make_urlb_env(
@@ -27,6 +29,8 @@ def make_urlb_env(
     fast_render: bool = False,
     render_mode: str | None = None,
     render_size: int = 256,
+    observation: str = "pixels",
+    **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """One of the twelve tasks of the benchmark. The defaults are the paper's ("Mastering the Unsupervised Reinforcement
     Learning Benchmark from Pixels", ICML 2023).
@@ -40,11 +44,14 @@ def make_urlb_env(
     :param fast_render: smaller shadow map: faster, not pixel-identical
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param render_size: height and width of what ``render()`` returns
-    :return: observations uint8 (image_size, image_size, 3), actions float32 (A,) in [-1, 1]; see
-        :class:`~sb3_dreamer_urlb.envs.pixel_env.PixelControlEnv`, and :class:`~sb3_dreamer_urlb.envs.options.PixelOptions`
-        for the options
+    :param observation: ``"pixels"``, ``"state"`` or ``"both"``
+    :param unknown: options that there are not
+    :return: observations uint8 (image_size, image_size, 3), or float32 (N,) for ``"state"``, or a Dict of both,
+        ``"image"`` and ``"state"``; actions float32 (A,) in [-1, 1]. See
+        :class:`~sb3_dreamer_urlb.envs.control_env.ControlEnv`, for the options
+        :class:`~sb3_dreamer_urlb.envs.options.PixelOptions`
     :raises ValueError: naming a wrong option, its value and what was expected
-    :raises RenderingBackendError: if MuJoCo cannot render here
+    :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
     check_urlb_task(domain, task)
     return make_dmc_env(
@@ -57,6 +64,8 @@ def make_urlb_env(
         fast_render=fast_render,
         render_mode=render_mode,
         render_size=render_size,
+        observation=observation,
+        **unknown,
     )
 
 
@@ -71,6 +80,8 @@ def make_dmc_env(
     fast_render: bool = False,
     render_mode: str | None = None,
     render_size: int = 256,
+    observation: str = "pixels",
+    **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """Any task of dm_control's suite, any of ``dm_control.manipulation``, or one of the benchmark's.
 
@@ -83,10 +94,13 @@ def make_dmc_env(
     :param fast_render: faster, not pixel-identical
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param render_size: height and width of what ``render()`` returns
+    :param observation: ``"pixels"``, ``"state"`` or ``"both"``
+    :param unknown: options that there are not
     :return: as :func:`make_urlb_env`
     :raises ValueError: naming a wrong option, its value and what was expected
-    :raises RenderingBackendError: if MuJoCo cannot render here
+    :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
+    refuse_unknown(unknown, "domain", "task")
     if camera is None:
         camera = 2 if domain == "quadruped" else 0
     options = PixelOptions(
@@ -97,17 +111,26 @@ def make_dmc_env(
         fast_render=fast_render,
         render_mode=render_mode,
         render_size=render_size,
+        observation=observation,
     )
+    if observation != "state":
+        load_renderer()  # at once, for the one clear error; states load one when somebody renders them
     control_env = make_control_env(domain, task)
-
-    from sb3_dreamer_urlb.envs.pixel_env import PixelControlEnv
 
     in_window = options.render_mode == "human"
     if in_window:
         options = dataclasses.replace(options, render_mode="rgb_array")
     is_urlb = task in URLB_TASKS.get(domain, ())
-    env = PixelControlEnv(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
+    env = _kind_of_env(observation)(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
     return gymnasium.wrappers.HumanRendering(env) if in_window else env
+
+
+def _kind_of_env(observation: str) -> type[ControlEnv]:
+    """The class for an option ``observation``."""
+    from sb3_dreamer_urlb.envs.pixel_env import PixelControlEnv
+    from sb3_dreamer_urlb.envs.state_env import PixelAndStateControlEnv, StateControlEnv
+
+    return {"pixels": PixelControlEnv, "state": StateControlEnv, "both": PixelAndStateControlEnv}[observation]
 
 
 def make_control_env(domain: str, task: str) -> control.Environment | composer.Environment:
@@ -115,11 +138,11 @@ def make_control_env(domain: str, task: str) -> control.Environment | composer.E
 
     :param domain: as for :func:`make_dmc_env`
     :param task: as for :func:`make_dmc_env`
-    :return: unseeded; its class is ``composer.Environment`` for ``jaco`` and ``manipulation``
+    :return: unseeded; its class is ``composer.Environment`` for ``jaco`` and ``manipulation``. OpenGL is loaded when somebody
+        renders its physics
     :raises ValueError: if there is no such task; it lists those there are
-    :raises RenderingBackendError: if MuJoCo cannot render here (dm_control binds itself to OpenGL when it is imported)
     """
-    load_renderer()
+    load_physics()
     from dm_control import manipulation, suite
 
     from sb3_dreamer_urlb.envs.jaco import make_jaco_task, make_manipulation_task

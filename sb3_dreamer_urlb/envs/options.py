@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 _MIN_SIZE, _MAX_SIZE = 16, 512  # pixels
+
+#: what an agent may see
+OBSERVATIONS = ("pixels", "state", "both")
+
+
+class UnknownOptionError(ValueError, TypeError):
+    """An option that there is not: a wrong value as all others are, and the TypeError that Python has for wrong arguments."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,8 @@ class PixelOptions:
         walker and the quadruped and twice for Jaco, but *not pixel-identical*: some ten of 4096 pixels differ
     :param render_mode: ``None``, ``"rgb_array"``, or ``"human"`` (a window; needs ``pygame`` and a display)
     :param render_size: height and width of what ``render()`` returns, in pixels, 16 to 512
+    :param observation: ``"pixels"``; ``"state"``: dm_control's own observation as a float32 vector, no renderer and no OpenGL
+        library needed unless ``render()`` is called; ``"both"``: a Dict of ``"image"`` and ``"state"``
     :raises ValueError: naming the option, its value and what was expected
     """
 
@@ -32,6 +41,7 @@ class PixelOptions:
     fast_render: bool = False
     render_mode: str | None = None
     render_size: int = 256
+    observation: str = "pixels"
 
     def __post_init__(self) -> None:
         for name in ("image_size", "render_size"):
@@ -47,6 +57,32 @@ class PixelOptions:
                 raise ValueError(f"{name}={getattr(self, name)!r}: expected True or False")
         if self.render_mode not in (None, "rgb_array", "human"):
             raise ValueError(f"render_mode={self.render_mode!r}: expected None, 'rgb_array' or 'human'")
+        if self.observation not in OBSERVATIONS:
+            raise ValueError(f"observation={self.observation!r}: expected one of {', '.join(map(repr, OBSERVATIONS))}")
+        self._refuse_what_has_no_effect()
+
+    def _refuse_what_has_no_effect(self) -> None:
+        """Options about pictures, where there are none."""
+        if self.observation == "state" and self.image_size != PixelOptions.image_size:
+            raise ValueError(
+                f"image_size={self.image_size!r}: observation='state' holds no image; leave it out, or ask for 'both'"
+            )
+        if self.observation == "state" and self.render_mode is None and self.fast_render:
+            raise ValueError("fast_render=True: observation='state' without a render_mode draws nothing; leave it out")
+
+
+def refuse_unknown(unknown: dict[str, Any], *others: str) -> None:
+    """Name options that there are not.
+
+    :param unknown: by name, what was left over
+    :param others: known ones besides those of :class:`PixelOptions`
+    :raises UnknownOptionError: if there are any; it lists the known ones
+    """
+    if unknown:
+        known = sorted([*(field.name for field in fields(PixelOptions)), *others])
+        raise UnknownOptionError(
+            f"unknown option{'s' * (len(unknown) > 1)} {', '.join(unknown)}: known are {', '.join(known)}"
+        )
 
 
 def _is_int(value: Any) -> bool:

@@ -1,8 +1,9 @@
-"""Which OpenGL backend MuJoCo draws with, settled before dm_control is imported.
+"""Which OpenGL backend MuJoCo draws with, settled before the first frame.
 
 dm_control reads ``MUJOCO_GL`` once, on import; where it is unset it takes GLFW, which on a machine without a display
-fails only at the first frame, with an error that names no cause. So everything in this package that needs dm_control
-calls :func:`load_renderer` first.
+fails only at the first frame, with an error that names no cause. And whatever it takes it loads at once, so that without
+an OpenGL library not even the physics can be imported. So everything in this package that needs dm_control calls
+:func:`load_physics` first, which imports it without any backend; :func:`load_renderer` chooses one when it is needed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import importlib
 import os
 import sys
 import warnings
+from typing import Any
 
 _INSTALL_HINT = (
     "Install EGL (`apt-get install libegl1 libopengl0 libgl1-mesa-dri`) or OSMesa (`apt-get install libosmesa6`); "
@@ -27,8 +29,31 @@ class RenderingBackendError(RuntimeError):
     """No OpenGL backend can draw in this process; the message says what to install or to set."""
 
 
+def load_physics() -> None:
+    """Import dm_control without OpenGL: no library is loaded and none is needed, whatever ``MUJOCO_GL`` says.
+
+    The first frame that somebody draws calls :func:`load_renderer`. Where dm_control was imported before, it is left as it is.
+    """
+    if "dm_control._render" in sys.modules:
+        return
+    wanted = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"  # for this import only: child processes and the renderer are to see the user's choice
+    try:
+        _import_dm_control().Renderer = _draw_on_demand
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if wanted is not None:
+            os.environ["MUJOCO_GL"] = wanted
+
+
+def _draw_on_demand(*args: Any, **kwargs: Any) -> Any:
+    """Stands for dm_control's ``Renderer`` class until the first frame: makes an OpenGL context of the backend then chosen."""
+    load_renderer()
+    return sys.modules["dm_control._render"].Renderer(*args, **kwargs)
+
+
 def load_renderer() -> str:
-    """Choose the OpenGL backend, import dm_control with it, and make sure that it can draw without a display.
+    """Choose the OpenGL backend, let dm_control draw with it, and make sure that it can without a display.
 
     ``MUJOCO_GL`` is respected where it is set. Where it is not, EGL is taken if it works, else OSMesa, and the variable
     is set, so that child processes agree. Costs about 20 ms before dm_control's own import; later calls are free.
@@ -36,14 +61,13 @@ def load_renderer() -> str:
     :return: dm_control's name of the backend: ``"egl"``, ``"osmesa"`` or ``"glfw"``
     :raises RenderingBackendError: if nothing can draw, or if dm_control was imported before with nothing that can
     """
-    already_imported = "dm_control._render" in sys.modules
+    render = sys.modules.get("dm_control._render")
+    postponed = render is not None and render.Renderer is _draw_on_demand
+    already_imported = render is not None and not postponed
     if not already_imported and sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
         os.environ["MUJOCO_GL"] = _choose_backend()
     try:
-        # dm_control.composer and scipy change the process's warning filters on import: put the user's back.
-        with warnings.catch_warnings():
-            importlib.import_module("dm_control.composer")
-            backend = importlib.import_module("dm_control._render").BACKEND
+        backend = (importlib.reload(render) if postponed and render else _import_dm_control()).BACKEND
     except ModuleNotFoundError:
         raise  # a package is missing, not a graphics library
     except (AttributeError, ImportError, RuntimeError) as error:
@@ -61,6 +85,17 @@ def load_renderer() -> str:
         )
         raise RenderingBackendError(f"dm_control draws with {backend!r}, which needs a display. {cause} {_INSTALL_HINT}")
     return backend
+
+
+def _import_dm_control() -> Any:
+    """Import dm_control with what ``MUJOCO_GL`` says.
+
+    :return: its module ``_render``
+    """
+    # dm_control.composer and scipy change the process's warning filters on import: put the user's back.
+    with warnings.catch_warnings():
+        importlib.import_module("dm_control.composer")
+        return importlib.import_module("dm_control._render")
 
 
 def claim_renderer() -> None:

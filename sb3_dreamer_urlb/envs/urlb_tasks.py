@@ -5,14 +5,14 @@ Laskin et al. 2021; used from pixels in "Mastering the Unsupervised Reinforcemen
 2023): new rewards on the suite's own models, which are compiled here from the suite's XML.
 """
 
-# ruff: noqa: E402 - an OpenGL backend must be chosen before dm_control is imported
+# ruff: noqa: E402 - dm_control must be imported without OpenGL, see load_physics
 from __future__ import annotations
 
 import numpy as np
 
-from sb3_dreamer_urlb.envs.rendering import load_renderer
+from sb3_dreamer_urlb.envs.rendering import load_physics
 
-load_renderer()
+load_physics()
 
 from dm_control import suite
 from dm_control.rl import control
