@@ -18,9 +18,8 @@ from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.native import planner_ops
 from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
-from sb3_dreamer_urlb.planning.prepared.agent import PreparedAgent
+from sb3_dreamer_urlb.planning.prepared.agent import NativeAgent, PreparedAgent, planned
 from sb3_dreamer_urlb.planning.prepared.native_parts import NativeDynamics, NativeHead
-from sb3_dreamer_urlb.planning.prepared.parts import Head
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
@@ -264,9 +263,9 @@ def agent(request, world_model):
     return agent_and_skill(world_model, *request.param)
 
 
-def _prepared(agent, skill, dtype, compile="native") -> PreparedAgent:
-    with native.using(compile, "cpu"):
-        return PreparedAgent(agent, skill, dtype)
+def _prepared(agent, skill, dtype) -> NativeAgent:
+    with native.using("native", "cpu"):
+        return NativeAgent(agent, skill, dtype)
 
 
 def _start(rssm: RSSM, seed: int, n: int = N * M) -> LatentState:
@@ -311,10 +310,13 @@ def test_short_products_stay_close(world_model):
 
 
 def test_who_plans_with_them(agent, monkeypatch):
-    assert isinstance(_prepared(*agent, th.float32, compile="eager")._value, Head)
-    assert isinstance(_prepared(*agent, th.float32, compile="auto")._value, NativeHead)
+    def form(compile):
+        with native.using(compile, "cpu"):
+            return type(planned(*agent))
+
+    assert form("eager") is PreparedAgent and form("auto") is NativeAgent
     monkeypatch.setattr(planner_ops, "fast", lambda: False)
-    assert isinstance(_prepared(*agent, th.float32)._value, Head)
+    assert form("native") is PreparedAgent
 
 
 def test_plans_do_not_depend_on_threads(agent):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch as th
 
@@ -22,22 +23,25 @@ ROWS = 8192
 class PreparedAgent(PlannedAgent):
     """:class:`~sb3_dreamer_urlb.agent.PlannedAgent` for one plan on a CPU. What its heads read are states, not features.
 
+    Of torch's operators; see the docstring of ``planning/prepared`` for the forms.
+
     :param agent: the networks
     :param skill: that each of the n environments follows, float (n, W); W is 0 without skills
     :param dtype: of products
     """
+
+    dynamics_class: ClassVar[type[Dynamics] | type[NativeDynamics]] = Dynamics
+    head_class: ClassVar[type[Head] | type[NativeHead]] = Head
 
     def __init__(self, agent: Agent, skill: th.Tensor, dtype: th.dtype):
         super().__init__(agent, skill)
         model = agent.world_model
         variables, classes = model.rssm.logits_shape
 
-        its_head, its_dynamics = (NativeHead, NativeDynamics) if native.on_lanes() else (Head, Dynamics)
-
         def head(mlp: MLP) -> Head | NativeHead:
-            return its_head(mlp, variables, classes, dtype)
+            return self.head_class(mlp, variables, classes, dtype)
 
-        self._dynamics = its_dynamics(model.rssm, dtype)
+        self._dynamics = self.dynamics_class(model.rssm, dtype)
         self._reward, self._value = head(model.reward), head(agent.slow_critic)
         self._discount = None if model.discount_logit is None else head(model.discount_logit)
 
@@ -46,16 +50,6 @@ class PreparedAgent(PlannedAgent):
     ) -> SampledState:
         with th.autocast("cpu", enabled=False):
             return self._dynamics.step(state, action, generator)
-
-    def imagine(  # type: ignore[override]
-        self, state: LatentState, action: th.Tensor, generator: th.Generator | None
-    ) -> Visited:
-        if isinstance(self._dynamics, NativeDynamics):
-            with th.autocast("cpu", enabled=False):
-                visited = self._dynamics.imagine(state, action, generator)
-            if visited is not None:
-                return visited
-        return super().imagine(state, action, generator)  # type: ignore[return-value]
 
     def features(self, states: Sequence[SampledState]) -> Visited:  # type: ignore[override]
         return Visited(th.stack([state.classes for state in states]), th.stack([state.short for state in states]))
@@ -86,12 +80,30 @@ class PreparedAgent(PlannedAgent):
         return (parts[0] if len(parts) == 1 else th.cat(parts)).view(*states.classes.shape[:2], -1)
 
 
+class NativeAgent(PreparedAgent):
+    """The same on kernels of our own; made and asked inside ``native.using()`` where these are fast."""
+
+    dynamics_class = NativeDynamics
+    head_class = NativeHead
+    _dynamics: NativeDynamics
+
+    def imagine(  # type: ignore[override]
+        self, state: LatentState, action: th.Tensor, generator: th.Generator | None
+    ) -> Visited:
+        """In one pass where the processor has tiles, else step by step."""
+        with th.autocast("cpu", enabled=False):
+            visited = self._dynamics.imagine(state, action, generator)
+        return super().imagine(state, action, generator) if visited is None else visited  # type: ignore[return-value]
+
+
 def planned(agent: Agent, skill: th.Tensor) -> PlannedAgent:
-    """The agent as a planner sees it, in the form for its device. Products run in the format that autocast asks for now.
+    """The agent as a planner sees it, in the form for its device: the one place that chooses. Products run in the format that
+    autocast asks for now.
 
     :param agent: the networks
     :param skill: that each of the n environments follows, float (n, W); W is 0 without skills
     """
     if skill.device.type != "cpu":
         return PlannedAgent(agent, skill)
-    return PreparedAgent(agent, skill, product_dtype(skill))
+    form = NativeAgent if native.on_lanes() else PreparedAgent
+    return form(agent, skill, product_dtype(skill))

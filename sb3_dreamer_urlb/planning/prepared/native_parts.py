@@ -1,4 +1,4 @@
-"""The parts of ``prepared_parts`` with kernels of our own (native/), which do in one pass what torch does in several."""
+"""The parts of ``parts`` with kernels of our own (native/), which do in one pass what torch does in several."""
 
 from __future__ import annotations
 
