@@ -46,17 +46,24 @@ def keeps_actor(domain: str | None) -> bool:
     return domain not in SPARSE_DOMAINS
 
 
-def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None) -> float:
-    """The actor's entropy bonus: the user's if given, otherwise the phase's, otherwise the intrinsic reward's.
+def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None, preset: float | None = None) -> float:
+    """The actor's entropy bonus: the user's; else, while exploring, the intrinsic reward's own; else the preset's or the phase's.
+
+    A reward that needs a bonus of its own (DIAYN) needs it whatever the size of the networks, so no preset replaces it.
 
     :param phase: a key of ``PHASES``
     :param intrinsic: the intrinsic reward, None without
     :param chosen: the user's
+    :param preset: that of the preset, None where it has none
     """
     if chosen is not None:
         return chosen
     default = PHASES[phase].ent_coef
-    return intrinsic.ent_coef if default is None else default
+    if default is None:
+        default = intrinsic.ent_coef
+        if default > 0:
+            return default
+    return default if preset is None else preset
 
 
 def __getattr__(name: str) -> Any:

@@ -45,6 +45,8 @@ NUMBERS: dict[str, checks.Range] = {
     "max_grad_norm": (0.0, False, math.inf, True),
     "weight_decay": (0.0, True, 1.0, False),
 }
+#: warm-ups: uniform in the action space, or beyond it, so that most numbers end at its bounds
+UNIFORM, SATURATED = WARMUPS = ("uniform", "saturated")
 #: arguments of the policy that the algorithm fills in itself
 POLICY_ARGUMENTS_OF_THE_MODEL = {
     "self",
@@ -88,8 +90,9 @@ def check(model: SavedAlgorithm) -> None:
             raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
     if given.discount_head is not None and not isinstance(given.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
-    if not isinstance(given.overlap, bool):
-        raise ValueError(f"overlap must be True or False, got {given.overlap!r}.")
+    for name in ("overlap", "reward_trains_model"):
+        if not isinstance(getattr(given, name), bool):
+            raise ValueError(f"{name} must be True or False, got {getattr(given, name)!r}.")
     checks.check_noise(model)
     _check_names(given, model.phase)
     _check_policy_kwargs(model)
@@ -103,6 +106,8 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
         raise ValueError(f"precision must be one of {PRECISIONS}, got {given.precision!r}.")
     if given.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
         raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {given.actor_gradient!r}.")
+    if given.warmup_actions not in WARMUPS:
+        raise ValueError(f"warmup_actions must be one of {WARMUPS}, got {given.warmup_actions!r}.")
     if given.compile not in COMPILE:
         raise ValueError(f"compile must be one of {COMPILE}, got {given.compile!r}.")
     method = given.intrinsic_reward
@@ -139,6 +144,8 @@ def _check_spaces(given: SimpleNamespace, model: SavedAlgorithm) -> None:
     if given.actor_gradient == REINFORCE and not make_actions(model.action_space).classes:
         # The density of a clamped action is not the normal's.
         raise ValueError(f"actor_gradient='reinforce' needs Discrete or MultiDiscrete actions, got {model.action_space}.")
+    if given.warmup_actions == SATURATED and make_actions(model.action_space).classes:
+        raise ValueError(f"warmup_actions={SATURATED!r} needs a Box action space, got {model.action_space}.")
     if given.action_noise is not None and make_actions(model.action_space).classes:
         raise ValueError(f"action_noise={given.action_noise!r} needs a Box action space, got {model.action_space}.")
 

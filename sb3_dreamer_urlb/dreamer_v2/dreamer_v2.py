@@ -17,7 +17,7 @@ from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
-from sb3_dreamer_urlb.dreamer_v2.presets import with_preset
+from sb3_dreamer_urlb.dreamer_v2.presets import get_preset, with_preset
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning import graphs
@@ -65,13 +65,18 @@ class DreamerV2(PhasedAlgorithm):
     :param planner: ``"dyna_mpc"``, ``"mppi"`` or None; acts in fine-tuning, also in ``predict``
     :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`
     :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
-    :param ent_coef: weight of the actor's entropy; None: 0 while exploring, 1e-4 on a task
+    :param ent_coef: weight of the actor's entropy; None: the intrinsic reward's own while exploring (DIAYN 0.1), otherwise the
+        preset's, otherwise 0 while exploring and 1e-4 on a task
     :param free_nats: the KL that costs nothing
     :param kl_balance: share of the KL's gradient that trains the prior
     :param kl_scale: weight of the KL in the model's loss
     :param actor_gradient: ``"dynamics"``: through the model, straight through where actions are one-hot; ``"reinforce"``: by
         the score function, for Discrete and MultiDiscrete actions; ``"auto"``: REINFORCE for these, dynamics for Box (as
         DreamerV2)
+    :param reward_trains_model: let the reward head's gradient reach the world model in fine-tuning; False as in the authors'
+        fine-tuning of DIAYN and APS (docs/algorithm.md)
+    :param warmup_actions: of the pre-training before its first update: ``"uniform"`` in the action space; ``"saturated"`` as in
+        the authors' code: uniform in ±A for A action dimensions, replayed as drawn and clipped for the environment (Box only)
     :param target_update_interval: updates between two copies of the critic to the slow critic
     :param adam_eps: ε of all optimisers
     :param max_grad_norm: bound of each optimiser's gradient norm
@@ -137,6 +142,8 @@ class DreamerV2(PhasedAlgorithm):
         kl_balance: float = 0.8,
         kl_scale: float = 1.0,
         actor_gradient: str = AUTO,
+        reward_trains_model: bool = True,
+        warmup_actions: str = arguments.UNIFORM,
         target_update_interval: int = 100,
         adam_eps: float = 1e-5,
         max_grad_norm: float = 100.0,
@@ -195,6 +202,8 @@ class DreamerV2(PhasedAlgorithm):
         self.kl_balance = kl_balance
         self.kl_scale = kl_scale
         self.actor_gradient = actor_gradient
+        self.reward_trains_model = reward_trains_model
+        self.warmup_actions = warmup_actions
         self.target_update_interval = target_update_interval
         self.adam_eps = adam_eps
         self.max_grad_norm = max_grad_norm
@@ -263,6 +272,7 @@ class DreamerV2(PhasedAlgorithm):
         return intrinsic
 
     def _learner_config(self, intrinsic: IntrinsicReward | None) -> LearnerConfig:
+        explores = phases.PHASES[self.phase].explores
         return LearnerConfig(
             learning_rate=self.lr_schedule(1),
             actor_learning_rate=self._actor_lr_schedule(1),
@@ -277,8 +287,9 @@ class DreamerV2(PhasedAlgorithm):
             imagination_horizon=self.imagination_horizon,
             gae_lambda=self.gae_lambda,
             target_update_interval=self.target_update_interval,
-            ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef),
-            reward_trains_model=not phases.PHASES[self.phase].explores,
+            ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef, get_preset(self.preset).get("ent_coef")),
+            reward_trains_model=self.reward_trains_model and not explores,
+            trains_behavior=explores or self.policy.planner is None or self.policy.planner.config.use_value,
             precision=self.precision,
             compile=self.compile,
         )
@@ -347,6 +358,12 @@ class DreamerV2(PhasedAlgorithm):
         state.action = th.as_tensor(actions, device=self.device)
         self._acting_state = state
         return self.policy.to_env_action(actions), actions
+
+    def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
+        actions = super()._random_actions(learning_starts, n_envs)
+        if actions is not None and self.warmup_actions == arguments.SATURATED:
+            actions = actions * np.float32(actions.shape[1])
+        return actions
 
     def _replayed_beside(self) -> dict[str, np.ndarray]:
         assert self._acting_state is not None

@@ -93,6 +93,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 #: dictionaries that a user's own extend instead of replacing them
 MERGED = ("policy_kwargs", "planner_kwargs", "replay_buffer_kwargs")
+#: what a preset proposes, and phase and intrinsic reward decide (phases.py): the argument stays None
+PROPOSED = ("ent_coef",)
 
 
 def with_preset(init: Callable[..., None]) -> Callable[..., None]:
@@ -110,7 +112,7 @@ def with_preset(init: Callable[..., None]) -> Callable[..., None]:
             if name in MERGED:
                 check_dict(name, given.get(name))
                 kwargs[name] = {**value, **(given.get(name) or {})}
-            elif name not in given:
+            elif name not in given and name not in PROPOSED:
                 kwargs[name] = value
         init(*args, **kwargs)
 

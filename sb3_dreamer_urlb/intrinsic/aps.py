@@ -66,12 +66,12 @@ class APS(SkillReward):
         return (relative - DISTANCE_FLOOR).clamp(min=0).mean(-1).log1p()
 
     def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
-        """The least-squares solution w of r_t · w ≈ φ(z_t), at unit length; a random skill if there was no reward at all.
+        """The least-squares solution w of r_t · w ≈ φ̂(z_t), at unit length; a random skill if there was no reward at all.
 
-        The features are the pre-trained ones. The authors' code forgets to carry them over and fits random features.
+        φ̂ of unit length, as in the reward: otherwise states of long features would outvote the others. The features are the pre-trained ones. The authors' code forgets to carry them over and fits random features.
         """
-        phi, reward = self.features(posterior.feature), batch.reward.unsqueeze(-1)
-        # One unknown a dimension: w = Σ r φ / Σ r², and the denominator drops out of the direction.
+        phi, reward = F.normalize(self.features(posterior.feature), dim=-1), batch.reward.unsqueeze(-1)
+        # One unknown a dimension: w = Σ r φ̂ / Σ r², and the denominator drops out of the direction.
         direction = (reward * phi).sum((0, 1))
         if not bool(direction.any()):
             return self.skills.draw(1)[0]

@@ -44,6 +44,7 @@ class LearnerConfig:
     target_update_interval: int
     ent_coef: float
     reward_trains_model: bool
+    trains_behavior: bool = True
     precision: str = "float32"
     kl_scale: float = 1.0
     actor_gradient: str = DYNAMICS
@@ -119,15 +120,19 @@ class Learner:
         with native.using(self.config.compile, self.device):
             metrics = self.recorder(batch, situation=self._situation())
         self.guard.count()
-        if self.agent.trains_behavior() and self.updates % self.config.target_update_interval == 0:
+        if self.trains_behavior() and self.updates % self.config.target_update_interval == 0:
             self.agent.slow_critic.load_state_dict(self.agent.critic.state_dict())
         self.updates += 1
         return metrics
 
+    def trains_behavior(self) -> bool:
+        """Whether actor and critic learn: not where nobody asks them (MPPI), nor while they have nothing to learn."""
+        return self.config.trains_behavior and self.agent.trains_behavior()
+
     def _situation(self) -> tuple[Hashable, ...]:
         """What decides on the host which way an update goes."""
         skills = self.agent.skills
-        return self.agent.trains_behavior(), skills is not None and skills.is_fixed
+        return self.trains_behavior(), skills is not None and skills.is_fixed
 
     def _memory(self) -> Iterator[th.Tensor]:
         """What an update reads and writes besides the batch."""
@@ -147,7 +152,7 @@ class Learner:
             posterior = model.observe(observation, batch.action, batch.is_first)
         metrics = self._update_intrinsic(_detached(posterior), batch)
         metrics.update(self._update_world_model(posterior, observation, batch))
-        if self.agent.trains_behavior():
+        if self.trains_behavior():
             metrics.update(self._update_behavior(posterior.state.detach(), batch.is_terminal))
             if self.agent.explores:
                 metrics["intrinsic_reward"] = metrics["imagined_reward"]

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTrans
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
+from sb3_dreamer_urlb.intrinsic import get_intrinsic_reward, registered_intrinsic_rewards
 
 SPACES = {
     "lopsided": spaces.Box(np.array([-3.0, 1.0], np.float32), np.array([0.5, 1.5], np.float32)),
@@ -470,6 +471,76 @@ def test_the_papers_defaults():
     }
     assert {name: defaults[name] for name in expected} == expected
     assert PRESETS["paper"] == {}
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("method", [*sorted(registered_intrinsic_rewards()), None])
+def test_entropy_bonus_of_every_preset_and_method(preset, method):
+    """A method's own bonus survives every preset; fine-tuning, and methods without one, take the preset's; a user's wins."""
+    small = {"policy_kwargs": PRESETS["tiny"]["policy_kwargs"], "batch_size": 2, "batch_length": 4, "buffer_size": 100}
+    proposed = PRESETS[preset].get("ent_coef")
+
+    def bonus(model):
+        return model.learner.config.ent_coef
+
+    if method is not None:
+        model = DreamerV2("CnnPolicy", CounterEnv(8), preset=preset, intrinsic_reward=method, **small)
+        own = get_intrinsic_reward(method).ent_coef
+        assert bonus(model) == (own or proposed or 0.0)
+        model.fine_tune()
+    else:
+        model = DreamerV2("CnnPolicy", CounterEnv(8), preset=preset, **small)
+    assert bonus(model) == (1e-4 if proposed is None else proposed)
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    assert bonus(DreamerV2.load(file)) == bonus(model)
+    chosen = DreamerV2("CnnPolicy", CounterEnv(8), preset=preset, intrinsic_reward=method, ent_coef=0.3, **small)
+    assert bonus(chosen) == 0.3
+
+
+def test_without_a_critic_in_the_plan_neither_actor_nor_critic_learn(tiny_model, weights):
+    """As the authors' MPPI; pre-training learns both, and so does Dyna-MPC."""
+    for planner, kwargs, learns in (
+        ("mppi", {}, False), ("dyna_mpc", {"use_value": False}, False), ("dyna_mpc", {}, True), (None, {}, True),
+    ):  # fmt: skip
+        model = tiny_model(planner=planner, planner_kwargs=kwargs, intrinsic_reward="lbs")
+        for exploring in (True, False):
+            agent = model.policy.agent
+            parts = ("world_model", "actor", "critic", "slow_critic")
+            before = {name: weights(getattr(agent, name)) for name in parts}
+            model.learn(40)
+            changed = {name for name in parts if weights(getattr(agent, name)) != before[name]}
+            assert changed == (set(parts) if learns or exploring else {"world_model"}) and model.phase_updates > 0
+            if exploring:
+                model.fine_tune()
+        assert model._planner_is_on() == (planner is not None)
+
+
+@pytest.mark.parametrize("flows", [True, False])
+@pytest.mark.parametrize("method", [None, "lbs", "aps"])
+def test_the_reward_heads_gradient_in_fine_tuning_is_an_option(tiny_model, method, flows):
+    model = tiny_model(intrinsic_reward=method, reward_trains_model=flows)
+    if method is not None:
+        assert not model.learner.config.reward_trains_model
+        model.fine_tune()
+    assert model.learner.config.reward_trains_model == flows
+
+
+@pytest.mark.parametrize("warmup", ["uniform", "saturated"])
+def test_random_warm_up(tiny_model, warmup):
+    """Saturated: uniform in ±A, replayed as drawn, clipped for the environment."""
+    env = CounterEnv(8)
+    model = tiny_model(env=env, warmup_actions=warmup, intrinsic_reward="lbs", learning_starts=400)
+    model.learn(400)
+    size = model.action_space.shape[0]
+    drawn = np.concatenate([episode.action[1:] for episode in model.replay_buffer.episodes])
+    bound = size if warmup == "saturated" else 1
+    assert np.abs(drawn).max() <= bound and np.abs(drawn).max() > 0.95 * bound
+    assert abs((np.abs(drawn) > 1).mean() - (1 - 1 / bound)) < 0.07
+    low, high = model.action_space.low, model.action_space.high
+    wanted = np.clip(drawn, -1, 1) * (high - low) / 2 + (high + low) / 2
+    assert np.allclose(np.stack([action for episode in env.received for action in episode])[: len(wanted)], wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from fake_envs import CounterEnv
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
+from test_behavior import SYNCHRONISING
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2
 
@@ -110,6 +111,32 @@ def test_steps_of_a_deterministic_episode_draw_independently(acting, observation
     assert any(not np.array_equal(draw[0][0], draw[0][1]) for draw in draws)  # environments do not share noise, either
     for step, draw in zip(steps, draws, strict=True):
         assert all(np.array_equal(one, other) for one, other in zip(at(step), draw, strict=True))
+
+
+def test_acting_never_asks_the_device_for_a_value(acting, observations, monkeypatch):
+    """The seed of a deterministic step comes from ``state``, which lies on the host."""
+    policy, obs = acting.policy, observations(2)
+    _, state = acting.predict(obs, deterministic=True)
+    tensor, _ = policy.obs_to_tensor(obs)
+    memory, starts = policy._memory(state, 2), th.tensor([False, True])
+
+    def step():
+        generator = policy._generator_of(state[-1], np.array([False, True]))
+        with th.no_grad():
+            return policy.choose(policy.observe(tensor, memory, starts, generator), True, generator)
+
+    step()  # anything that torch sets up once
+
+    def refuse(*_, **__):
+        raise AssertionError("acting waited for the device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in SYNCHRONISING:
+            patch.setattr(th.Tensor, name, refuse)
+        with pytest.raises(AssertionError, match="waited"):
+            th.ones(()).item()
+        after = step()
+    assert after.steps.tolist() == [2, 1]
 
 
 def test_the_mean_action_of_an_episode_has_no_accidental_direction(tiny_model, observations):

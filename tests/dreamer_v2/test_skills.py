@@ -227,12 +227,23 @@ def test_aps_solves_least_squares(learner, batch):
     agent = learner("aps").agent
     posterior = infer(agent.world_model, batch)
     with th.no_grad():
-        phi = agent.intrinsic.features(posterior.feature).flatten(0, 1)
+        phi = F.normalize(agent.intrinsic.features(posterior.feature).flatten(0, 1), dim=-1)
         solution = th.linalg.lstsq(batch.reward.view(-1, 1), phi).solution[0]
         chosen = agent.intrinsic.choose_skill(agent.actor, posterior, batch)
         assert th.allclose(chosen, F.normalize(solution, dim=0), atol=1e-4)
         rewardless = dataclasses.replace(batch, reward=th.zeros_like(batch.reward))
         agent.skills.check(agent.intrinsic.choose_skill(agent.actor, posterior, rewardless))
+
+
+def test_aps_weighs_states_by_their_rewards_alone(learner, batch):
+    """φ of unit length, as in the reward: the length of a state's features is no vote."""
+    agent = learner("aps").agent
+    posterior = infer(agent.world_model, batch)
+    with th.no_grad():
+        chosen = agent.intrinsic.choose_skill(agent.actor, posterior, batch)
+        original = agent.intrinsic.features.forward
+        agent.intrinsic.features.forward = lambda feature: original(feature) * th.rand(*feature.shape[:-1], 1).add(0.1)
+        assert th.allclose(agent.intrinsic.choose_skill(agent.actor, posterior, batch), chosen, atol=1e-5)
 
 
 def test_fine_tuning_chooses_once_and_waits_until_then(skilled, weights, tmp_path):
