@@ -75,8 +75,8 @@ class DreamerV2(PhasedAlgorithm):
         DreamerV2)
     :param reward_trains_model: let the reward head's gradient reach the world model in fine-tuning; False as in the authors'
         fine-tuning of DIAYN and APS (docs/algorithm.md)
-    :param warmup_actions: of the pre-training before its first update: ``"uniform"`` in the action space; ``"saturated"`` as in
-        the authors' code: uniform in ±A for A action dimensions, replayed as drawn and clipped for the environment (Box only)
+    :param warmup_actions: of the pre-training before its first update: ``"uniform"`` in the action space; ``"saturated"``, the
+        authors' own: uniform in ±A for A action dimensions, replayed as drawn and clipped for the environment (Box only)
     :param target_update_interval: updates between two copies of the critic to the slow critic
     :param adam_eps: ε of all optimisers
     :param max_grad_norm: bound of each optimiser's gradient norm

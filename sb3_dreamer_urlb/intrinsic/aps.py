@@ -68,7 +68,8 @@ class APS(SkillReward):
     def choose_skill(self, actor: Actor | CategoricalActor, posterior: Posterior, batch: SequenceBatch) -> th.Tensor:
         """The least-squares solution w of r_t · w ≈ φ̂(z_t), at unit length; a random skill if there was no reward at all.
 
-        φ̂ of unit length, as in the reward: otherwise states of long features would outvote the others. The features are the pre-trained ones. The authors' code forgets to carry them over and fits random features.
+        φ̂ of unit length, as in the reward: otherwise states of long features would outvote the others. The features
+        are the pre-trained ones. The authors' code forgets to carry them over and fits random features.
         """
         phi, reward = F.normalize(self.features(posterior.feature), dim=-1), batch.reward.unsqueeze(-1)
         # One unknown a dimension: w = Σ r φ̂ / Σ r², and the denominator drops out of the direction.
