@@ -47,7 +47,7 @@ def keeps_actor(domain: str | None) -> bool:
 
 
 def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None, preset: float | None = None) -> float:
-    """The actor's entropy bonus: the user's, else that of an intrinsic reward that explores, else the preset's, else 0 or 1e-4.
+    """The actor's entropy bonus: the user's, else an exploring reward's own, else the preset's, else the phase's.
 
     A reward that needs a bonus of its own (DIAYN) needs it whatever the size of the networks, so no preset replaces it.
 
