@@ -60,9 +60,10 @@ def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None, preset: flo
         return chosen
     default = PHASES[phase].ent_coef
     if default is None:
-        default = intrinsic.ent_coef
-        if default > 0:
-            return default
+        own: float = intrinsic.ent_coef
+        if own > 0:
+            return own
+        default = own
     return default if preset is None else preset
 
 
