@@ -64,7 +64,7 @@ class Agent(nn.Module):
     def trains_behavior(self) -> bool:
         """Whether actor and critic have something to learn now.
 
-        Not while random actions explore, and not in fine-tuning before its skill is chosen (spec/algorithms §6).
+        Not while random actions explore, and not in fine-tuning before its skill is chosen (docs/algorithm.md, "Skills").
         """
         if self.explores:
             return not self.acts_randomly()

@@ -1,4 +1,4 @@
-"""Actor and critic that learn in imagination (paper §2, spec/algorithms §2)."""
+"""Actor and critic that learn in imagination (paper §2, docs/algorithm.md, "Behaviour")."""
 
 from __future__ import annotations
 

@@ -387,7 +387,7 @@ class DreamerV2(PhasedAlgorithm):
         skills.fix(skills.numbered(int(skill)) if isinstance(skill, int | np.integer) else skill)
 
     def _choose_skill(self) -> None:
-        """Choose the skill that serves the task best (spec/algorithms §6)."""
+        """Choose the skill that serves the task best (docs/algorithm.md, "Skills")."""
         agent = self.policy.agent
         if not isinstance(agent.intrinsic, SkillReward) or agent.explores:
             return

@@ -240,7 +240,7 @@ class DreamerPolicy(BasePolicy):
         return ActingState(latent, state.action, plan, self._skill_to_follow(state.skill, steps, generator), steps + 1)
 
     def _skill_to_follow(self, skill: th.Tensor, steps: th.Tensor, generator: th.Generator | None) -> th.Tensor:
-        """The fixed skill; without one, a new random one every ``skills.interval`` steps (spec/algorithms §6)."""
+        """The fixed skill; without one, a new random one every ``skills.interval`` steps (docs/algorithm.md, "Skills")."""
         skills = self.agent.skills
         if skills is None:
             return skill

@@ -13,7 +13,7 @@ from typing import Any
 from sb3_dreamer_urlb.number_checks import check_dict
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # Paper appendix "Hyperparameters" and spec/algorithms: the constructor's own defaults.
+    # Paper appendix "Hyperparameters" and docs/algorithm.md: the constructor's own defaults.
     "paper": {},
     # Learns on two CPU cores, in thousands of updates instead of tens of thousands. Found by trial on walker stand, see
     # docs/results.md: a faster actor saturates before the model is any good, and without the larger entropy bonus it also

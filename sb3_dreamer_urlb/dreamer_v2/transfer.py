@@ -5,8 +5,8 @@ from __future__ import annotations
 from sb3_dreamer_urlb.agent import Agent
 
 KEPT, ACTOR_CHOICE, CRITIC_CHOICE, FRESH = "kept", "kept if keep_actor", "kept if keep_critic", "fresh"
-#: What a fine-tuning takes over from the pre-trained agent (spec/algorithms §4). Optimisers and replay always stay behind,
-#: and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
+#: What a fine-tuning takes over from the pre-trained agent (docs/algorithm.md, "Transfer"). Optimisers and replay always
+#: stay behind, and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
 TRANSFER: dict[str, str] = {
     "world_model.encoder": KEPT,
     "world_model.rssm": KEPT,
@@ -17,11 +17,11 @@ TRANSFER: dict[str, str] = {
     "critic": CRITIC_CHOICE,
     "slow_critic": CRITIC_CHOICE,
     "reward_normalizer": FRESH,
-    # The skills of DIAYN and APS, and what APS chooses one by (spec/algorithms §6).
+    # The skills of DIAYN and APS, and what APS chooses one by (docs/algorithm.md, "Skills").
     "intrinsic": KEPT,
 }
 
-#: replayed states by which DIAYN and APS choose the skill for a task (spec/algorithms §6)
+#: replayed states by which DIAYN and APS choose the skill for a task (docs/algorithm.md, "Skills")
 SKILL_STATES = 4096
 
 

@@ -1,4 +1,4 @@
-"""What an algorithm makes of the steps of its environments that went wrong (spec/reliability "Long runs")."""
+"""What an algorithm makes of the steps of its environments that went wrong (docs/reliability.md, "Environments that fail")."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Environments that raise or give numbers that are none: the episode is cut short, counted, and the run goes on.
 
 A step that failed is marked in its ``info``, so that the replay ends the episode there as truncated and never stores the
-row (spec/reliability "Long runs"). :class:`FaultGuard` does it inside a process,
+row (docs/reliability.md, "Environments that fail"). :class:`FaultGuard` does it inside a process,
 :class:`~sb3_dreamer_urlb.envs.supervisor.SupervisedVecEnv` for processes that die or hang.
 """
 

@@ -1,4 +1,4 @@
-"""Environments in processes that may die, raise or hang (spec/reliability "Long runs")."""
+"""Environments in processes that may die, raise or hang (docs/reliability.md, "Environments that fail")."""
 
 from __future__ import annotations
 

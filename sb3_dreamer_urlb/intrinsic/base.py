@@ -23,7 +23,7 @@ class RewardSource(nn.Module):
     itself, pre-training one of the subclasses below :class:`IntrinsicReward`.
     """
 
-    #: μ of the reward normaliser; 1 switches it off (spec/algorithms §2)
+    #: μ of the reward normaliser; 1 switches it off (docs/algorithm.md, "Behaviour")
     momentum: ClassVar[float] = 1.0
 
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics] | None:

@@ -1,4 +1,4 @@
-"""Mean and deviation of everything seen so far (Chan's merge of batches; spec/algorithms §5)."""
+"""Mean and deviation of everything seen so far (Chan's merge of batches; docs/algorithm.md, "Running statistics")."""
 
 from __future__ import annotations
 

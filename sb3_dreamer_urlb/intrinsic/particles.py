@@ -35,7 +35,7 @@ def knn_distances(particles: th.Tensor, k: int, chunk_size: int | None = None) -
     """Distances of each particle to its k nearest, itself included, with gradients to both ends of each distance.
 
     The same numbers as ``(x[:, None] - x[None]).norm(dim=-1).topk(k, largest=False).values``, in O(n·(k + d)) memory
-    (spec/algorithms §5). The gradient of a distance of exactly zero is zero; there are no second derivatives.
+    (docs/algorithm.md, "APT"). The gradient of a distance of exactly zero is zero; there are no second derivatives.
 
     :param particles: float32 (n, d); float64 works too
     :param k: neighbours of each, from 1 (itself) to n

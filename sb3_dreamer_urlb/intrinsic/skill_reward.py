@@ -1,4 +1,4 @@
-"""What DIAYN and APS share: a space of skills, and the choice of one of them for a task (spec/algorithms §6)."""
+"""What DIAYN and APS share: a space of skills, and the choice of one of them for a task (docs/algorithm.md, "Skills")."""
 
 from __future__ import annotations
 

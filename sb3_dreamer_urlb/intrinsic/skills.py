@@ -1,4 +1,4 @@
-"""Skills w: what DIAYN and APS condition the actor and the critic on (spec/algorithms §6)."""
+"""Skills w: what DIAYN and APS condition the actor and the critic on (docs/algorithm.md, "Skills")."""
 
 from __future__ import annotations
 

@@ -55,7 +55,8 @@ class Learner:
     """Trains an agent: intrinsic reward, world model, actor, critic.
 
     The intrinsic reward comes first because some methods label the rewards that the reward head learns. It reads what the
-    world model inferred before its step, so for the others the order makes no difference (spec/algorithms §2).
+    world model inferred before its step, so for the others the order makes no difference (docs/algorithm.md, "Order of an
+    update").
 
     :param agent: the networks
     :param config: the numbers

@@ -1,4 +1,4 @@
-"""The optimiser of every part: clip the global norm, shrink every weight a little, Adam step (spec/algorithms §1)."""
+"""The optimiser of every part: clip the global norm, shrink every weight, Adam step (docs/algorithm.md, "Optimiser")."""
 
 from __future__ import annotations
 

@@ -197,7 +197,8 @@ class _SquaredDistance(Function):
 class BoundedNormal:
     """The actor's distribution: a normal whose samples are clamped to the action box.
 
-    Entropy and log-probability are those of the *untruncated* normal, as in the authors' code (spec/algorithms §2).
+    Entropy and log-probability are those of the *untruncated* normal, as in the authors' code (docs/algorithm.md,
+    "Behaviour").
 
     :param mean: in (-1, 1), float (…, A)
     :param std: positive, float (…, A)

@@ -14,7 +14,7 @@ from sb3_dreamer_urlb.nn.precision import full
 
 
 class MLP(nn.Module):
-    """ELU layers ``dense`` and one linear output ``out`` (spec/algorithms §1, "MLP 4×400 ELU").
+    """ELU layers ``dense`` and one linear output ``out`` (docs/algorithm.md, "World model").
 
     :param inputs: size of the input
     :param net_arch: widths of the hidden layers

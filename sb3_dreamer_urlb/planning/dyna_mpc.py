@@ -1,4 +1,4 @@
-"""Dyna-MPC (paper §3.1, algorithm 1; details in spec/algorithms §7): plan with the model, the actor and the critic.
+"""Dyna-MPC (paper §3.1, algorithm 1; details in docs/algorithm.md, "Dyna-MPC"): plan with the model, the actor and the critic.
 
 Symbols: n environments, H horizon, N sampled and P actor trajectories, M = N + P, A action size.
 """

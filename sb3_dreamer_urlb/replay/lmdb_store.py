@@ -1,4 +1,4 @@
-"""Finished episodes in an LMDB file: they survive the process, and need no memory (spec/reliability "Replay").
+"""Finished episodes in an LMDB file: they survive the process, and need no memory (docs/reliability.md, "Replay on disk").
 
 An episode is stored in chunks of ``CHUNK`` rows, each the raw bytes of one column after the other. Its chunks, the
 removal of what it drives out and the new cursor are one transaction: after a kill at any moment the file holds whole

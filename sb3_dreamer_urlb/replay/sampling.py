@@ -32,7 +32,7 @@ def draw(sampling: str, rng: np.random.Generator, episodes: Sequence[Any], lengt
 
 
 def _by_episode(rng: np.random.Generator, episodes: Sequence[Any], length: int, n: int) -> Iterator[Pieces]:
-    """An episode uniformly, then a start uniformly (spec/algorithms §3); none may be shorter than a sequence."""
+    """An episode uniformly, then a start uniformly (docs/algorithm.md, "Replay"); none may be shorter than a sequence."""
     for index in rng.integers(len(episodes), size=n):
         start = int(rng.integers(len(episodes[index]) - length + 1))
         yield [(int(index), start, start + length)]

@@ -1,4 +1,4 @@
-"""Replay of whole episodes, drawn as sequences (spec/algorithms §3, spec/reliability "Replay").
+"""Replay of whole episodes, drawn as sequences (docs/algorithm.md, "Replay"; docs/concepts.md, "Replay").
 
 Row t of an episode holds observation t with the action and the reward that *led to* it. Each environment writes its own
 stream, so episodes may end at different times; only finished episodes are drawn. A sequence never leaves its episode, unless

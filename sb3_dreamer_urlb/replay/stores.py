@@ -1,4 +1,4 @@
-"""Where finished episodes are kept: one interface, in memory, on the device or on disk (spec/reliability "Replay").
+"""Where finished episodes are kept: one interface, in memory, on the device or on disk (docs/concepts.md, "Replay").
 
 A store is a queue of episodes, oldest first: ``popleft``, ``len``, indexing and iteration; an episode has a length and
 ``rows(start, stop)``, which gives arrays by name. In memory it is a deque of

@@ -1,7 +1,7 @@
 """SB3's EvalCallback ↔ JSON: the best result so far, when the next evaluation is due, and all results.
 
 A new EvalCallback begins at -inf, overwrites ``best_model.zip`` with whatever comes first and ``evaluations.npz`` with what
-comes from then on (spec/reliability "Resume").
+comes from then on (docs/reliability.md, "A run that goes on").
 """
 
 from __future__ import annotations

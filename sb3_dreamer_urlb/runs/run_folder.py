@@ -1,8 +1,8 @@
 """Runs that go on after kill -9: a folder with the last checkpoint, and the way back.
 
 ``snapshot.zip`` is the checkpoint. It names the files of ``replay/`` that belong to it, so a checkpoint is: write the new
-episodes, write the snapshot, rename it, and only then remove what no snapshot names any more (spec/reliability "Resume").
-A kill at any point leaves the checkpoint before or the one after.
+episodes, write the snapshot, rename it, and only then remove what no snapshot names any more (docs/reliability.md, "A run
+that goes on"). A kill at any point leaves the checkpoint before or the one after.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def deconvolution_kernels(size: int) -> list[int]:
 
 
 class ConvDecoder(nn.Module):
-    """A linear layer to a 1×1 map, then transposed convolutions (spec/algorithms §1).
+    """A linear layer to a 1×1 map, then transposed convolutions (docs/algorithm.md, "World model").
 
     ELU follows every transposed convolution, *also the last*: the authors' published numbers carry it, and it is
     harmless since targets lie in [-0.5, 0.5].

@@ -24,7 +24,7 @@ class Encoder(nn.Module):
 
 
 class ConvEncoder(Encoder):
-    """Strided convolutions, an activation after each, flattened channel-first (spec/algorithms §1).
+    """Strided convolutions, an activation after each, flattened channel-first (docs/algorithm.md, "World model").
 
     At 64×64 these are DreamerV2's four stages, 64 → 31 → 14 → 6 → 2; other sizes take as many stages as fit.
 

@@ -82,7 +82,7 @@ class WorldModel(nn.Module):
         reward_trains_model: bool,
         kl_scale: float = 1.0,
     ) -> tuple[th.Tensor, Metrics]:
-        """The negative evidence lower bound of a replayed batch (spec/algorithms §1).
+        """The negative evidence lower bound of a replayed batch (docs/algorithm.md, "World model").
 
         :param posterior: what :meth:`observe` inferred about it, with its graph
         :param observation: that it was inferred from, preprocessed, (B, T, …)

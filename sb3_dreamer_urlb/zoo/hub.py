@@ -1,6 +1,6 @@
 """rl_zoo3's ``push_to_hub`` and ``load_from_hub`` for DreamerV2, with the arguments that they have there.
 
-rl_zoo3's own push does not start with the present sb3-team-hf-integration (spec/sb3-plugin). And what rl_zoo3 reads from a
+rl_zoo3's own push does not start with the present sb3-team-hf-integration. And what rl_zoo3 reads from a
 run's folder it reads with loaders that run code: here nothing of a downloaded repository reaches them unchecked.
 """
 

@@ -1,4 +1,4 @@
-"""The trap test: rows that know where they belong, so that a wrong one cannot hide (spec/reliability "Replay")."""
+"""The trap test: rows that know where they belong, so that a wrong one cannot hide (docs/concepts.md, "Replay")."""
 
 from __future__ import annotations
 
