@@ -86,7 +86,7 @@ class Curves:
         changed = type(own)(dataclasses.replace(own.config, **changes), own.gae_lambda)
 
         def plan() -> None:
-            policy.planner = changed
+            policy._planner = changed
             self.planner.predict(self.images[:environments])
 
         return plan

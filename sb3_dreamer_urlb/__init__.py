@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2.policies import CnnPolicy, DreamerPolicy
     from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
     from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError
-    from sb3_dreamer_urlb.planning import PlannerConfig
+    from sb3_dreamer_urlb.planning import Planner, PlannerConfig, register_planner
     from sb3_dreamer_urlb.replay import SequenceReplayBuffer
     from sb3_dreamer_urlb.snapshots import SnapshotError
 
@@ -34,6 +34,7 @@ _MODULES = {
     "IntrinsicReward": "intrinsic",
     "NumericalFaultError": "learning.numerical_faults",
     "PhaseSwitchCallback": "callbacks.phase_switch",
+    "Planner": "planning",
     "PlannerConfig": "planning",
     "RunCheckpointCallback": "callbacks.checkpoint",
     "SequenceReplayBuffer": "replay",
@@ -41,6 +42,7 @@ _MODULES = {
     "SnapshotError": "snapshots",
     "VideoCallback": "callbacks.videos",
     "register_intrinsic_reward": "intrinsic",
+    "register_planner": "planning",
 }
 
 __all__ = [
@@ -52,6 +54,7 @@ __all__ = [
     "IntrinsicReward",
     "NumericalFaultError",
     "PhaseSwitchCallback",
+    "Planner",
     "PlannerConfig",
     "RunCheckpointCallback",
     "SequenceReplayBuffer",
@@ -60,6 +63,7 @@ __all__ = [
     "VideoCallback",
     "register_envs",
     "register_intrinsic_reward",
+    "register_planner",
 ]
 
 register_envs()

@@ -119,7 +119,7 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
             f"A model in the phase {phase!r} needs an intrinsic_reward, got None: to move on to the task, "
             "load it as it is and call fine_tune()."
         )
-    make_planner(given.planner, given.planner_kwargs, given.gae_lambda)
+    make_planner(given.planner, given.planner_kwargs, given.gae_lambda, classes=None)
     buffer_class = given.replay_buffer_class
     if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):
         raise ValueError(

@@ -23,7 +23,7 @@ from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrin
 from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
-from sb3_dreamer_urlb.planning import make_planner
+from sb3_dreamer_urlb.planning import Planner, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import MetricMeans
@@ -62,8 +62,9 @@ class DreamerV2(PhasedAlgorithm):
     :param intrinsic_kwargs: hyperparameters of the intrinsic reward, for a name or a class
     :param skill_selection_starts: agent steps of fine-tuning before a skill is chosen (DIAYN, APS); until then only the
         world model learns
-    :param planner: ``"dyna_mpc"``, ``"mppi"`` or None; acts in fine-tuning, also in ``predict``
-    :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`
+    :param planner: ``"dyna_mpc"``, ``"mppi"``, another registered name, a subclass or an instance of
+        :class:`~sb3_dreamer_urlb.planning.Planner`, or None; acts in fine-tuning, also in ``predict``
+    :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`, for a name or a class
     :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
     :param ent_coef: weight of the actor's entropy; None: the intrinsic reward's own while exploring (DIAYN 0.1), otherwise the
         preset's, otherwise 0 while exploring and 1e-4 on a task
@@ -134,7 +135,7 @@ class DreamerV2(PhasedAlgorithm):
         intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None = None,
         intrinsic_kwargs: dict[str, Any] | None = None,
         skill_selection_starts: int = 2000,
-        planner: str | None = None,
+        planner: str | type[Planner] | Planner | None = None,
         planner_kwargs: dict[str, Any] | None = None,
         planner_delay: int = 500,
         ent_coef: float | None = None,

@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.nn import precision as precisions
 from sb3_dreamer_urlb.number_checks import is_integer
-from sb3_dreamer_urlb.planning import DynaMPC
+from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.planning.prepared.agent import planned
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
@@ -102,7 +102,7 @@ class DreamerPolicy(BasePolicy):
         discount_head: bool = False,
         intrinsic: IntrinsicReward | None = None,
         explores: bool = True,
-        planner: DynaMPC | None = None,
+        planner: Planner | None = None,
         planning: bool = True,
         precision: str = "float32",
         compile: str = "eager",
@@ -138,7 +138,7 @@ class DreamerPolicy(BasePolicy):
         )
         self.agent = Agent(world_model, net_arch, intrinsic, explores, self.actions.classes)
         self.intrinsic = intrinsic
-        self.planner = planner
+        self._planner = planner
         self.planning = planning
         self.precision = precision
         self.compile_mode = compile
@@ -168,6 +168,18 @@ class DreamerPolicy(BasePolicy):
         parameters.update(precision=self.precision, compile=self.compile_mode)
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
         return parameters
+
+    @property
+    def planner(self) -> Planner | None:
+        """Who chooses actions while ``planning``; set when the policy is made, so that it is saved and transferred."""
+        return self._planner
+
+    @planner.setter
+    def planner(self, _: Any) -> None:
+        raise AttributeError(
+            "A policy's planner is not changed by hand, for the model would save and fine-tune with the old one: "
+            "give it to the model, DreamerV2(..., planner=...) or DreamerV2.load(path, planner=...)."
+        )
 
     @property
     def planner_dtype(self) -> th.dtype:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sb3_dreamer_urlb.number_checks import check_dict
+from sb3_dreamer_urlb.planning import Planner
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Paper appendix "Hyperparameters" and docs/algorithm.md: the constructor's own defaults.
@@ -109,6 +110,8 @@ def with_preset(init: Callable[..., None]) -> Callable[..., None]:
         given = signature.bind_partial(*args, **kwargs).arguments
         preset = get_preset(given.get("preset", signature.parameters["preset"].default))
         for name, value in preset.items():
+            if name == "planner_kwargs" and isinstance(given.get("planner"), Planner):
+                continue  # it has its own
             if name in MERGED:
                 check_dict(name, given.get(name))
                 kwargs[name] = {**value, **(given.get(name) or {})}

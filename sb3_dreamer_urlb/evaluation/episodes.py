@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_dreamer_urlb.evaluation.recording import copy_statistics
 from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.planning import planner_name
 
 #: of the paper
 EPISODES = 10
@@ -160,7 +161,7 @@ def _acting(model: Any, planner: str) -> tuple[PolicyPredictor, str]:
     """Who is asked for actions, and the name of its planner."""
     if planner not in PLANNERS:
         raise ValueError(f"planner must be one of {PLANNERS}, got {planner!r}.")
-    name = getattr(model, "planner", None)
+    name = planner_name(getattr(model, "planner", None))
     if planner == ON and name is None:
         raise ValueError("planner='on': the model has none; load it with planner='dyna_mpc', say.")
     plans = name is not None and (planner == ON or (planner == AUTO and model._planner_is_on()))

@@ -14,6 +14,7 @@ import torch as th
 
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.version import __version__
 
@@ -95,7 +96,7 @@ def facts_about(model: DreamerV2, env_id: str, command: str | None) -> ModelFact
         pretrained_frames=(model.phase_frames if exploring else model.pretrained_frames) if known else None,
         frames=model.phase_frames,
         action_repeat=model.action_repeat,
-        planner=model.planner,
+        planner=planner_name(model.planner),
         seed=model.seed,
         command=command,
     )

@@ -6,12 +6,11 @@ The paper plans in boxes only; this is the cross-entropy method's usual form for
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch as th
 
 from sb3_dreamer_urlb.nn import distributions
-from sb3_dreamer_urlb.planning.dyna_mpc import DynaMPC, PlannableModel, PlannerConfig, _shifted
+from sb3_dreamer_urlb.planning.config import PlannableModel
+from sb3_dreamer_urlb.planning.dyna_mpc import DynaMPC, _shifted
 from sb3_dreamer_urlb.types import LatentState
 
 
@@ -25,9 +24,7 @@ class CategoricalDynaMPC(DynaMPC):
     :param classes: number of classes of each choice
     """
 
-    def __init__(self, config: PlannerConfig, gae_lambda: float, classes: Sequence[int]):
-        super().__init__(config, gae_lambda)
-        self.classes = tuple(classes)
+    plans_numbers, plans_choices = False, True
 
     def plan(
         self,
@@ -37,17 +34,17 @@ class CategoricalDynaMPC(DynaMPC):
         generator: th.Generator | None,
         explore: bool,
     ) -> tuple[th.Tensor, th.Tensor]:
-        """See :meth:`DynaMPC.plan`; actions are one-hot, the mean holds probabilities, zeros where none are known yet."""
+        """See :meth:`Planner.plan`; actions are one-hot, the mean holds probabilities, zeros where none are known yet."""
         probs = self._mixed(_shifted(previous_mean))
         proposals = self._actor_proposals(model, state, generator)
         trajectories = state.repeat(self.config.n_samples + proposals.shape[1])
         for _ in range(self.config.iterations):
             samples = self._draw(probs.unsqueeze(1).expand(-1, self.config.n_samples, -1, -1), generator)
             actions = th.cat([samples, proposals], 1)
-            value = self._evaluate(model, trajectories, actions, generator)
-            elites, weight = self._elites(actions, value)
+            value = self.evaluate(model, trajectories, actions, generator)
+            elites, weight = self.elites(actions, value)
             # The elites' mean is how often each class is chosen.
-            probs = self._mixed(self._refine(probs, elites, weight)[0])
+            probs = self._mixed(self.refine(probs, elites, weight)[0])
         if explore:
             return self._draw(probs[:, 0], generator), probs
         return self._draw_elite(elites, weight, generator), probs

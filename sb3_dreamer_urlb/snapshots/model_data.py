@@ -10,6 +10,7 @@ import torch as th
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
+from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.random_state import capture
@@ -101,6 +102,8 @@ def blank(
         raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
     given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
     _check_method(arguments, given)
+    if isinstance(given.get("planner"), Planner):
+        given.setdefault("planner_kwargs", None)  # those stored belong to the one that it replaces
     decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
     for name, value in decoded.items():
         if (missing := values.contains_custom(value)) is not None:

@@ -1,6 +1,6 @@
 """Python values ↔ plain JSON. What is more than a number, a text, a list or a dictionary carries a tag from a fixed table.
 
-Reading never looks a name up anywhere but in that table and in the registry of intrinsic rewards.
+Reading never looks a name up anywhere but in that table and in the registries of intrinsic rewards and planners.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod, get_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import is_integer
-from sb3_dreamer_urlb.planning import CategoricalDynaMPC, DynaMPC, PlannerConfig
+from sb3_dreamer_urlb.planning import CategoricalDynaMPC, DynaMPC, Planner, PlannerConfig, registered_planners
 
 TAG = "!"
 CUSTOM = "custom"
@@ -76,7 +76,8 @@ def encode(value: Any) -> Any:
         if type(value) is kind or (isinstance(value, spaces.Space) and isinstance(value, kind)):
             tag, fields = encoder(value)
             return {TAG: tag, **{name: encode(field) for name, field in fields.items()}}
-    return _encode_intrinsic(value)
+    planner = isinstance(value, Planner) or (isinstance(value, type) and issubclass(value, Planner))
+    return _encode_planner(value) if planner else _encode_intrinsic(value)
 
 
 def decode(value: Any) -> Any:
@@ -187,6 +188,36 @@ def _categorical_planner(config: dict[str, Any], gae_lambda: float, classes: lis
     return CategoricalDynaMPC(PlannerConfig(**config), float(gae_lambda), classes)
 
 
+def _encode_planner(value: Any) -> Any:
+    """A class by the name it is registered under; an instance with its arguments, too, if it has those of every planner."""
+    kind = value if isinstance(value, type) else type(value)
+    places = [(name, kinds.index(kind)) for name, kinds in registered_planners().items() if kind in kinds]
+    if not places:
+        raise Unstorable(f"A {kind.__module__}.{kind.__qualname__} cannot be stored")
+    named = {TAG: "registered planner", "name": places[0][0], "which": places[0][1]}
+    if isinstance(value, type):
+        return named
+    if "__init__" in {name for base in kind.__mro__[: kind.__mro__.index(Planner)] for name in vars(base)}:
+        raise Unstorable(f"The planner {places[0][0]!r} has a constructor of its own")
+    fields = {"config": dataclasses.asdict(value.config), "gae_lambda": value.gae_lambda, "classes": value.classes}
+    return {**named, "arguments": encode(fields)}
+
+
+def _registered_planner(name: str, which: int, arguments: dict[str, Any] | None = None) -> Any:
+    kinds = registered_planners().get(name)
+    if kinds is None:
+        raise ValueError(f"Unknown planner {name!r}; known are {sorted(registered_planners())}: register it before loading")
+    if type(which) is not int or not 0 <= which < len(kinds):
+        raise ValueError(f"it holds the planner {name!r} for actions that it does not plan")
+    kind = kinds[which]
+    if arguments is None:
+        return kind
+    config, classes = kind.config_class(**arguments["config"]), arguments["classes"]
+    if not isinstance(classes, list) or not all(is_integer(count) and count >= 1 for count in classes):
+        raise ValueError(f"it holds a planner of the classes {str(classes)[:80]}")
+    return kind(config, float(arguments["gae_lambda"]), classes)
+
+
 ENCODERS: dict[type, Callable[[Any], tuple[str, dict[str, Any]]]] = {
     spaces.Box: _box_fields,
     spaces.Discrete: lambda x: ("Discrete", {"n": x.n, "start": x.start, "dtype": np.dtype(x.dtype).name}),
@@ -215,6 +246,7 @@ DECODERS: dict[str, Callable[..., Any]] = {
     "intrinsic": _intrinsic,
     "planner": lambda config, gae_lambda: DynaMPC(PlannerConfig(**config), float(gae_lambda)),
     "categorical planner": _categorical_planner,
+    "registered planner": _registered_planner,
     "Box": _box,
     "Discrete": _discrete,
     "MultiBinary": spaces.MultiBinary,

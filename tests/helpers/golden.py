@@ -354,13 +354,13 @@ def check_planner(case: Case, worst: Worst, seen_as: Callable[[Agent, th.Tensor]
 
         def spying_elites(actions, value, values=values):  # type: ignore[no-untyped-def]
             values.append(value)
-            return DynaMPC._elites(planner, actions, value)
+            return DynaMPC.elites(planner, actions, value)
 
         with (
             th.no_grad(),
             mock.patch.object(planner, "_sampling_noise", lambda *_, noise=noise: noise),
             mock.patch.object(planner, "_exploration_noise", lambda *_, given=given: given["in.action_noise"].unsqueeze(0)),
-            mock.patch.object(planner, "_elites", spying_elites),
+            mock.patch.object(planner, "elites", spying_elites),
         ):
             embed = agent.world_model.encoder(agent.world_model.preprocess(given["in.observation"].unsqueeze(0)))
             is_first = th.tensor([step == 0])

@@ -102,8 +102,8 @@ def test_refinement_formula(seeded):
     config = PlannerConfig(H, 16, 1, 6, 0.0, temperature=0.5, momentum=0.1, min_std=0.3)
     planner = DynaMPC(config, 0.95)
     actions, value, mean = th.rand(2, 16, H, A), th.randn(2, 16), th.rand(2, H, A)
-    elites, weight = planner._elites(actions, value)
-    new_mean, new_std = planner._refine(mean, elites, weight)
+    elites, weight = planner.elites(actions, value)
+    new_mean, new_std = planner.refine(mean, elites, weight)
     for i in range(2):
         best = value[i].argsort(descending=True)[:6]
         rho = th.exp(0.5 * (value[i][best] - value[i].max()))
@@ -117,13 +117,13 @@ def test_refinement_formula(seeded):
 
 def test_the_action_is_an_elites_first_not_the_mean(monkeypatch, seeded):
     elites = {}
-    original = DynaMPC._elites
+    original = DynaMPC.elites
 
     def spy(self, actions, value):
         elites["actions"], elites["weight"] = original(self, actions, value)
         return elites["actions"], elites["weight"]
 
-    monkeypatch.setattr(DynaMPC, "_elites", spy)
+    monkeypatch.setattr(DynaMPC, "elites", spy)
     # Little noise, so that no two samples are clamped to the same corner.
     noise = 0.1 * th.randn(1, 1, 32, H, A)
     monkeypatch.setattr(DynaMPC, "_sampling_noise", lambda *_: noise)

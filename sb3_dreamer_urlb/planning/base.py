@@ -1,0 +1,61 @@
+"""What a planner is: the interface that the policy acts through."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch as th
+
+from sb3_dreamer_urlb.planning.config import PlannableModel, PlannerConfig
+from sb3_dreamer_urlb.types import LatentState
+
+
+class Planner(ABC):
+    """Chooses actions by looking ahead in the model. n environments, H horizon, A action size.
+
+    A subclass keeps the constructor: hyperparameters of its own are fields of a dataclass that extends :class:`PlannerConfig`,
+    named by ``config_class``. So planners are saved by their name and their arguments.
+
+    :param config: hyperparameters
+    :param gae_lambda: λ of the returns that rank trajectories, the one the critic was trained with
+    :param classes: number of classes of each choice that is an action; empty where actions are numbers
+    :raises ValueError: for a configuration of another kind, or actions that this planner does not choose
+    """
+
+    #: kind of ``config``; what ``planner_kwargs`` may name
+    config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
+    #: whether actions may be numbers in [-1, 1], and choices among classes (one-hot)
+    plans_numbers: ClassVar[bool] = True
+    plans_choices: ClassVar[bool] = False
+
+    def __init__(self, config: PlannerConfig, gae_lambda: float, classes: Sequence[int] = ()):
+        name = type(self).__qualname__
+        if not isinstance(config, self.config_class):
+            raise ValueError(f"{name} needs a {self.config_class.__qualname__}, got {config!r}.")
+        if not (self.plans_choices if classes else self.plans_numbers):
+            kind = "Discrete or MultiDiscrete" if classes else "Box"
+            raise ValueError(f"{name} does not plan {kind} actions: derive it from {'Categorical' * bool(classes)}DynaMPC.")
+        self.config = config
+        self.gae_lambda = gae_lambda
+        self.classes: tuple[int, ...] = tuple(classes)
+
+    @abstractmethod
+    def plan(
+        self,
+        model: PlannableModel,
+        state: LatentState,
+        previous_mean: th.Tensor,
+        generator: th.Generator | None,
+        explore: bool,
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Choose an action for each environment.
+
+        :param model: what to plan in
+        :param state: current posterior states, (n, …)
+        :param previous_mean: the mean that the last step returned, zeros where an episode begins, float (n, H, A)
+        :param generator: source of randomness, the global one if None
+        :param explore: add the planner's noise to the action
+        :return: action in [-1, 1], float (n, A), and the mean to hand in at the next step, float (n, H, A)
+        """
