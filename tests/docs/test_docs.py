@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
+from types import ModuleType
 
 import gymnasium
 import numpy as np
@@ -107,10 +108,11 @@ def test_guards_and_a_replay_on_disk(small_world, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
-def test_howto(small_world, tmp_path, page):
+def test_howto(small_world, tmp_path, page, monkeypatch):
     blocks = code_blocks(page)
     assert blocks
     names = {"__name__": "howto"}
+    monkeypatch.setitem(sys.modules, "howto", ModuleType("howto"))  # dataclasses look their module up
     for block in blocks:
         run(block, names)
     if page.stem in AFTERWARDS:

@@ -79,7 +79,7 @@ def test_it_plans_and_is_the_same_after_load_and_fine_tune(tiny_model, tmp_path,
     loaded.learn(24)
     assert Own.asked > before
     assert planner_name(loaded.planner) == "own"
-    assert run_evaluation(loaded, CounterEnv(), 1, planner=ON).planner == "own"
+    assert run_evaluation(loaded, loaded.env, 1, planner=ON).planner == "own"
     loaded.policy.save(tmp_path / "policy")
     check_own(type("", (), {"policy": DreamerPolicy.load(tmp_path / "policy")}), gae_lambda)
 
