@@ -410,6 +410,18 @@ class DreamerV2(PhasedAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfDreamerV2:
+        """Collect and learn for ``total_timesteps`` agent steps; as SB3's, but warm-ups count by phase, not by call.
+
+        :param total_timesteps: agent steps; where a ``RunCheckpointCallback(..., resume="auto")`` goes on with a run, of the
+            whole run
+        :param callback: SB3 callback(s)
+        :param log_interval: episodes between two log lines
+        :param tb_log_name: name of the TensorBoard run
+        :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
+        :param progress_bar: show one
+        :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
+        :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
+        """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
