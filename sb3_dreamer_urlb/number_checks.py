@@ -6,6 +6,22 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+
+
+def plain(value: Any) -> Any:
+    """numpy's scalars as Python's numbers and booleans, in dictionaries, lists and tuples, too; all else as it is.
+
+    Everything that takes arguments takes them through this: torch, Stable-Baselines3 and JSON each refuse some of numpy's.
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value) is dict:
+        return {key: plain(item) for key, item in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(plain(item) for item in value)
+    return value
+
 
 def is_integer(value: Any) -> bool:
     """Whether ``value`` is a whole number by type."""

@@ -15,11 +15,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm import checks, training_loop
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
-from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
+from sb3_dreamer_urlb.number_checks import plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.types import MetricMeans
@@ -159,8 +160,8 @@ class PhasedAlgorithm(CollectingAlgorithm):
             return
         # Watched from now on, also while others step it.
         last_touches(self.env)
-        self.action_repeat = int(env_attribute(self.env, "action_repeat", 1))
-        self.domain = env_attribute(self.env, "domain", None)
+        self.action_repeat = env_fact(self.env, "action_repeat", 1)
+        self.domain = env_fact(self.env, "domain", None)
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
@@ -221,6 +222,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
+        total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
         with self.during_learn:
             if resume_if_asked(self, callback):
                 total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False

@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.dreamer_v2.presets import get_preset, with_preset
-from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
@@ -228,7 +228,7 @@ class DreamerV2(PhasedAlgorithm):
     def _read_env(self) -> None:
         super()._read_env()
         if self.env is not None and self.discount_head is None:
-            self.discount_head = not env_attribute(self.env, "never_terminates", False)
+            self.discount_head = not env_fact(self.env, "never_terminates", False)
 
     def _check_env(self, env: VecEnv) -> None:
         super()._check_env(env)

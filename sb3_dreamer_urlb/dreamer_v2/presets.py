@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from sb3_dreamer_urlb.number_checks import check_dict
+from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.planning import Planner
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -107,6 +107,7 @@ def with_preset(init: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(init)
     def wrapped(*args: Any, **kwargs: Any) -> None:
+        args, kwargs = plain(args), plain(kwargs)
         given = signature.bind_partial(*args, **kwargs).arguments
         preset = get_preset(given.get("preset", signature.parameters["preset"].default))
         for name, value in preset.items():

@@ -104,14 +104,19 @@ def blank(
     _check_method(arguments, given)
     if isinstance(given.get("planner"), Planner):
         given.setdefault("planner_kwargs", None)  # those stored belong to the one that it replaces
-    decoded = {name: values.decode(value) for name, value in arguments.items() if name not in given}
+    # A stored value that is replaced need not be one that can be read here.
+    decoded = {
+        name: values.decode(value) for name, value in arguments.items() if name not in given or name.endswith("_kwargs")
+    }
+    given = {name: _extended(name, decoded.get(name), value) for name, value in given.items()}
+    decoded |= given
     for name, value in decoded.items():
         if (missing := values.contains_custom(value)) is not None:
             raise ValueError(
                 f"its {name} was {missing.description}, which no file can hold; "
                 f"give it again: load(..., custom_objects={{{name!r}: ...}})"
             )
-        if name in CHECKS and not CHECKS[name](value):
+        if name in CHECKS and name not in given and not CHECKS[name](value):
             raise ValueError(f"its {name} is {str(value)[:80]!r}")
     if isinstance(decoded.get("train_freq"), list):
         decoded["train_freq"] = tuple(decoded["train_freq"])
@@ -125,9 +130,21 @@ def blank(
     preset = decoded.pop("preset", "paper")
     constructor: Any = algorithm
     model: Model
-    model = constructor(policy, None, device=device, preset="paper", _init_setup_model=False, **{**decoded, **given})
+    model = constructor(policy, None, device=device, preset="paper", _init_setup_model=False, **decoded)
     model.preset = preset
     return model
+
+
+def _extended(name: str, stored: Any, given: Any) -> Any:
+    """What a caller's argument makes of the stored one: dictionaries extend, as they extend a preset's; all else, None too, replaces.
+
+    :param name: of the argument
+    :param stored: of the file
+    :param given: the caller's
+    """
+    if name.endswith("_kwargs") and isinstance(stored, dict) and isinstance(given, dict):
+        return {**stored, **given}
+    return given
 
 
 def _check_method(stored: dict[str, Any], given: dict[str, Any]) -> None:

@@ -152,9 +152,9 @@ def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, A
         raise ValueError(
             f"the replay buffer was filled in the phase {str(data['phase'])[:80]!r}, the model is in {buffer.phase!r}"
         )
-    for name in ("n_envs", "batch_length"):
-        if data[name] != getattr(buffer, name):
-            raise ValueError(f"the replay buffer has {name}={data[name]}, the model {getattr(buffer, name)}")
+    # Another number of environments will do: open episodes are ended, so that each begins a stream of its own.
+    if data["batch_length"] != buffer.batch_length:
+        raise ValueError(f"the replay buffer has batch_length={data['batch_length']}, the model {buffer.batch_length}")
     for name in ("observation_space", "action_space"):
         space = values.decode(data[name])
         if space != getattr(buffer, name):

@@ -44,6 +44,9 @@ def encode_or_describe(value: Any) -> Any:
     try:
         return encode(value)
     except Unstorable:
+        if isinstance(value, dict) and all(isinstance(key, str) and key != TAG for key in value):
+            # Only what cannot be stored must be given again.
+            return {key: encode_or_describe(item) for key, item in value.items()}
         described = value if isinstance(value, type) or hasattr(value, "__qualname__") else type(value)
         return {TAG: CUSTOM, "description": f"{described.__module__}.{described.__qualname__}"}
 
