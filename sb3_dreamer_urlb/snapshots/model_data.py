@@ -136,7 +136,7 @@ def blank(
 
 
 def _extended(name: str, stored: Any, given: Any) -> Any:
-    """What a caller's argument makes of the stored one: dictionaries extend, as they extend a preset's; all else, None too, replaces.
+    """What a caller's argument makes of the stored one: dictionaries extend, as a preset's; else it replaces.
 
     :param name: of the argument
     :param stored: of the file
