@@ -9,13 +9,15 @@ what it sees of it, ``options`` what one can choose about it;
 
 from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.envs.dmc import make_control_env, make_dmc_env, make_urlb_env
+from sb3_dreamer_urlb.envs.dmc import make_control_env, make_dmc_env, make_rwrl_env, make_urlb_env
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError, FaultGuard
 from sb3_dreamer_urlb.envs.options import PixelOptions
+from sb3_dreamer_urlb.envs.perturbations import Perturbations
 from sb3_dreamer_urlb.envs.registration import DOMAINS, PRIMAL_TASK, URLB_TASKS, env_id, register_envs
 from sb3_dreamer_urlb.envs.rendering import RenderingBackendError, load_physics, load_renderer
 
 if TYPE_CHECKING:
+    from sb3_dreamer_urlb.envs.perturbation_wrapper import PerturbationWrapper
     from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv, make_supervised_vec_env
 
 __all__ = [
@@ -24,6 +26,8 @@ __all__ = [
     "URLB_TASKS",
     "EnvironmentFaultError",
     "FaultGuard",
+    "PerturbationWrapper",
+    "Perturbations",
     "PixelOptions",
     "RenderingBackendError",
     "SupervisedVecEnv",
@@ -32,6 +36,7 @@ __all__ = [
     "load_renderer",
     "make_control_env",
     "make_dmc_env",
+    "make_rwrl_env",
     "make_supervised_vec_env",
     "make_urlb_env",
     "register_envs",
@@ -39,6 +44,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "PerturbationWrapper":  # and dm_control only for who perturbs
+        from sb3_dreamer_urlb.envs.perturbation_wrapper import PerturbationWrapper
+
+        return PerturbationWrapper
     # Stable-Baselines3, and torch with it, only for who asks.
     if name in ("SupervisedVecEnv", "make_supervised_vec_env"):
         from sb3_dreamer_urlb.envs import supervisor

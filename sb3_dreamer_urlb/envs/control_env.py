@@ -30,6 +30,8 @@ from dm_control.rl import control  # noqa: E402
 if TYPE_CHECKING:
     import dm_env
 
+    from sb3_dreamer_urlb.envs.perturbed_control import PerturbedControl
+
 _FAST_SHADOW_MAP = 512  # texels a side; dm_control's own is 2048, composer's 4096
 _UNLIMITED = 1e10  # what dm_control gives as the bound of an actuator that has none (mjMAXVAL)
 
@@ -77,6 +79,8 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
 
         self._options = options
         self._control = control_env
+        #: what steps it in place of itself, if it is perturbed: see ``perturbed_control``
+        self.perturbed: PerturbedControl | None = None
         self._check_camera(options.camera)
         self._was_reset, self._episode_over, self._closed = False, True, False
 
@@ -111,7 +115,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         if seed is not None:
             self._seed_task(seed)
         with self._named_physics_errors():
-            time_step = self._control.reset()
+            time_step = (self.perturbed or self._control).reset()
         self._prepare_renderer()
         self._was_reset, self._episode_over = True, False
         return self._observe(time_step), {}
@@ -131,7 +135,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         task_reward, terminated, truncated = 0.0, False, False
         for _ in range(self.action_repeat):
             with self._named_physics_errors():
-                time_step = self._control.step(control_action)
+                time_step = (self.perturbed or self._control).step(control_action)
             task_reward += float(time_step.reward or 0.0)
             if time_step.last():
                 # dm_control's time limits leave the discount at 1: the state goes on, only the episode does not.
@@ -176,6 +180,8 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
             self._control._random_state = stream
         else:
             self._control.task._random = stream
+        if self.perturbed is not None:
+            self.perturbed.seed(seed)
 
     def _to_control(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """From [-1, 1] to the task's own bounds; a value outside ends outside, and MuJoCo clamps it.

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from sb3_dreamer_urlb.envs import perturbations as rwrl
 from sb3_dreamer_urlb.envs.options import PixelOptions, refuse_unknown
+from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
 from sb3_dreamer_urlb.envs.registration import URLB_TASKS, check_urlb_task
 from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
 
@@ -30,6 +34,7 @@ def make_urlb_env(
     render_mode: str | None = None,
     render_size: int = 256,
     observation: str = "pixels",
+    perturbations: Perturbations | Mapping[str, Any] | None = None,
     **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """One of the twelve tasks of the benchmark. The defaults are the paper's ("Mastering the Unsupervised Reinforcement
@@ -45,6 +50,8 @@ def make_urlb_env(
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param render_size: height and width of what ``render()`` returns
     :param observation: ``"pixels"``, ``"state"`` or ``"both"``
+    :param perturbations: of the Real-World RL suite, or their arguments by name; see
+        :class:`~sb3_dreamer_urlb.envs.perturbations.Perturbations`
     :param unknown: options that there are not
     :return: observations uint8 (image_size, image_size, 3), or float32 (N,) for ``"state"``, or a Dict of both,
         ``"image"`` and ``"state"``; actions float32 (A,) in [-1, 1]. See
@@ -65,6 +72,7 @@ def make_urlb_env(
         render_mode=render_mode,
         render_size=render_size,
         observation=observation,
+        perturbations=perturbations,
         **unknown,
     )
 
@@ -81,6 +89,7 @@ def make_dmc_env(
     render_mode: str | None = None,
     render_size: int = 256,
     observation: str = "pixels",
+    perturbations: Perturbations | Mapping[str, Any] | None = None,
     **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """Any task of dm_control's suite, any of ``dm_control.manipulation``, or one of the benchmark's.
@@ -95,34 +104,110 @@ def make_dmc_env(
     :param render_mode: None, ``"rgb_array"`` or ``"human"``
     :param render_size: height and width of what ``render()`` returns
     :param observation: ``"pixels"``, ``"state"`` or ``"both"``
+    :param perturbations: of the Real-World RL suite, or their arguments by name; see
+        :class:`~sb3_dreamer_urlb.envs.perturbations.Perturbations`
     :param unknown: options that there are not
     :return: as :func:`make_urlb_env`
     :raises ValueError: naming a wrong option, its value and what was expected
     :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
-    refuse_unknown(unknown, "domain", "task")
-    if camera is None:
-        camera = 2 if domain == "quadruped" else 0
+    refuse_unknown(unknown, "domain", "task", "perturbations")
     options = PixelOptions(
         image_size=image_size,
         action_repeat=action_repeat,
-        camera=camera,
+        camera=_default_camera(domain) if camera is None else camera,
         reward_free=reward_free,
         fast_render=fast_render,
         render_mode=render_mode,
         render_size=render_size,
         observation=observation,
     )
-    if observation != "state":
-        load_renderer()  # at once, for the one clear error; states load one when somebody renders them
-    control_env = make_control_env(domain, task)
+    perturbed_by = make_perturbations(perturbations)
+    if perturbed_by is not None:
+        perturbed_by.limb(domain)  # before anything is loaded
+    return _show(options, perturbed_by, domain, task, functools.partial(make_control_env, domain, task))
 
+
+def make_rwrl_env(
+    domain: str,
+    task: str = "walk",
+    level: str = "easy",
+    *,
+    hard_thigh: str = "suite",
+    keep_buffers: bool = True,
+    camera: int | str | None = None,
+    **options: Any,
+) -> gymnasium.Env[Any, Any]:
+    """One of the Real-World RL suite's tasks at one of its levels, as the paper's robustness study uses them (Section
+    "Real-World Reinforcement Learning Benchmark"; Appendix "RWRL settings").
+
+    The unperturbed task is dm_control's, but that the quadruped starts upright, as in the suite.
+
+    :param domain: ``walker`` or ``quadruped``
+    :param task: ``walk``
+    :param level: ``easy``, ``medium`` or ``hard``
+    :param hard_thigh: range of the walker's thighs at the level hard: ``"suite"`` from 0.225, ``"paper"`` from 0.15 m; see
+        :func:`~sb3_dreamer_urlb.envs.perturbations.level`
+    :param keep_buffers: delay buffers survive a reset, as in the suite
+    :param camera: a camera's id or name; None as in :func:`make_urlb_env`
+    :param options: those of :class:`~sb3_dreamer_urlb.envs.options.PixelOptions`
+    :return: as :func:`make_urlb_env`
+    :raises ValueError: naming a wrong option, its value and what was expected
+    :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
+    """
+    if task != "walk":
+        raise ValueError(f"task={task!r}: the Real-World RL suite's levels are of the task walk")
+    perturbed_by = rwrl.level(domain, level, hard_thigh=hard_thigh, keep_buffers=keep_buffers)
+    known = {field.name for field in dataclasses.fields(PixelOptions)}
+    refuse_unknown(
+        {name: value for name, value in options.items() if name not in known},
+        *("domain", "task", "level", "hard_thigh", "keep_buffers"),
+    )
+    shown = PixelOptions(camera=_default_camera(domain) if camera is None else camera, **options)
+    return _show(shown, perturbed_by, domain, task, functools.partial(_make_rwrl_control, domain))
+
+
+def _show(
+    options: PixelOptions,
+    perturbed_by: Perturbations | None,
+    domain: str,
+    task: str,
+    make_control: Callable[[], control.Environment | composer.Environment],
+) -> gymnasium.Env[Any, Any]:
+    """A control environment as an agent sees it.
+
+    :param options: how it is shown
+    :param perturbed_by: what is done to it
+    :param domain: of the task
+    :param task: its name
+    :param make_control: makes the bare environment
+    """
+    if options.observation != "state":
+        load_renderer()  # at once, for the one clear error; states load one when somebody renders them
+    control_env = make_control()
     in_window = options.render_mode == "human"
     if in_window:
         options = dataclasses.replace(options, render_mode="rgb_array")
     is_urlb = task in URLB_TASKS.get(domain, ())
-    env = _kind_of_env(observation)(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
+    env = _kind_of_env(options.observation)(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
+    if perturbed_by is not None:
+        from sb3_dreamer_urlb.envs.perturbation_wrapper import perturb
+
+        perturb(env, perturbed_by)
     return gymnasium.wrappers.HumanRendering(env) if in_window else env
+
+
+def _default_camera(domain: str) -> int:
+    """The benchmark's: ``y`` of the quadruped, else the model's first."""
+    return 2 if domain == "quadruped" else 0
+
+
+def _make_rwrl_control(domain: str) -> control.Environment:
+    """The bare environment of the suite's task walk."""
+    load_physics()
+    from sb3_dreamer_urlb.envs.urlb_tasks import make_suite_task, make_upright_walk
+
+    return make_upright_walk() if domain == "quadruped" else make_suite_task(domain, "walk")
 
 
 def _kind_of_env(observation: str) -> type[ControlEnv]:

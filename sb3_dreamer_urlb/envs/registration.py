@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import gymnasium
 
+from sb3_dreamer_urlb.envs.perturbations import LEVELS
+
 #: The three domains with four tasks each (URLB, Laskin et al. 2021).
 URLB_TASKS: dict[str, tuple[str, ...]] = {
     "walker": ("stand", "walk", "run", "flip"),
     "quadruped": ("stand", "walk", "run", "jump"),
     "jaco": ("reach_top_left", "reach_top_right", "reach_bottom_left", "reach_bottom_right"),
 }
+
+#: Bodies that the Real-World RL suite's levels are of; its task is walk.
+RWRL_DOMAINS = ("walker", "quadruped")
 
 DOMAINS: tuple[str, ...] = tuple(URLB_TASKS)
 
@@ -37,7 +42,8 @@ def check_urlb_task(domain: str, task: str) -> None:
 
 
 def register_envs() -> None:
-    """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, and ``urlb/dm_control-v0`` for any other
+    """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, ``rwrl/<domain>-walk-<level>-v0`` of the
+    Real-World RL suite, and ``urlb/dm_control-v0`` for any other
     task of dm_control (``gymnasium.make("urlb/dm_control-v0", domain="cartpole", task="swingup")``).
 
     Entry points are strings, so that a spawned process can load them. No ``max_episode_steps``: dm_control truncates, and
@@ -47,6 +53,9 @@ def register_envs() -> None:
         for task in tasks:
             _register(env_id(domain, task), "make_urlb_env", {"domain": domain, "task": task})
     _register("urlb/dm_control-v0", "make_dmc_env", {})
+    for domain in RWRL_DOMAINS:
+        for level in LEVELS:
+            _register(f"rwrl/{domain}-walk-{level}-v0", "make_rwrl_env", {"domain": domain, "task": "walk", "level": level})
 
 
 def _register(name: str, function: str, kwargs: dict[str, str]) -> None:

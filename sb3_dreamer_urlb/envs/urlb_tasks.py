@@ -16,13 +16,15 @@ load_physics()
 
 from dm_control import suite
 from dm_control.rl import control
-from dm_control.suite import common, quadruped, walker
+from dm_control.suite import base, common, quadruped, walker
 from dm_control.utils import rewards
 
 # Seconds, as in the suite: 1000 control steps an episode for both.
 _WALKER_TIME_LIMIT, _WALKER_CONTROL_STEP = 25, 0.025
 _QUADRUPED_TIME_LIMIT, _QUADRUPED_CONTROL_STEP = 20, 0.02
 _QUADRUPED_FLOOR = 10  # half-size in metres, that of the suite's walk task; the floor shows in the pixels
+
+_QUADRUPED_WALK_SPEED = 0.5  # m/s at which dm_control's walk earns its full reward
 
 _FLIP_MOMENTUM = 5.0  # kg m²/s about +y at which the flip term is 1
 _JUMP_HEIGHT = 1.0  # height of the centre of mass in metres at which the jump term is 1
@@ -78,6 +80,31 @@ class Jump(Stand):
             sigmoid="linear",
         )
         return super().get_reward(physics) * height
+
+
+class UprightMove(quadruped.Move):
+    """As the Real-World RL suite begins its episodes: upright, turned at random about the vertical."""
+
+    def initialize_episode(self, physics: quadruped.Physics) -> None:
+        """Set the state of an episode's start."""
+        azimuth = self.random.uniform(0, 2 * np.pi)
+        orientation = np.array((np.cos(azimuth / 2), 0, 0, np.sin(azimuth / 2)))
+        quadruped._find_non_contacting_height(physics, orientation)
+        base.Task.initialize_episode(self, physics)
+
+
+def make_upright_walk() -> control.Environment:
+    """The quadruped's walk of the Real-World RL suite, not perturbed: dm_control's, but that it starts on its feet.
+
+    :return: the control environment, unseeded
+    """
+    env = suite.load("quadruped", "walk")
+    return control.Environment(
+        env.physics,
+        UprightMove(desired_speed=_QUADRUPED_WALK_SPEED),
+        time_limit=_QUADRUPED_TIME_LIMIT,
+        control_timestep=_QUADRUPED_CONTROL_STEP,
+    )
 
 
 def make_suite_task(domain: str, task: str) -> control.Environment:
