@@ -213,9 +213,14 @@ class BoundedNormal:
         """The most likely action, float (…, A)."""
         return self.mean
 
-    def sample(self, generator: th.Generator | None = None) -> th.Tensor:
-        """A reparametrised sample clamped to ±(1 − 1e-6); the clamp passes gradients straight through."""
-        sample = self.mean + self.std * draw_normal(self.mean.shape, self.mean, generator)
+    def sample(self, generator: th.Generator | None = None, noise_clip: float | None = None) -> th.Tensor:
+        """A reparametrised sample clamped to ±(1 − 1e-6); the clamp passes gradients straight through.
+
+        :param generator: source of randomness
+        :param noise_clip: bound of the distance from the mean, None for none
+        """
+        noise = self.std * draw_normal(self.mean.shape, self.mean, generator)
+        sample = self.mean + (noise if noise_clip is None else noise.clamp(-noise_clip, noise_clip))
         clamped = sample.detach().clamp(-1 + ACTION_MARGIN, 1 - ACTION_MARGIN)
         return sample + (clamped - sample.detach()) if sample.requires_grad else clamped
 

@@ -1,0 +1,1 @@
+"""DrQ-v2, the benchmark's agent without a world model: one file a concern."""
