@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import native, phases
-from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
@@ -22,7 +22,6 @@ from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
-from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.planning import Planner, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.spaces.actions import make_actions
@@ -31,7 +30,7 @@ from sb3_dreamer_urlb.types import MetricMeans
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
 
 
-class DreamerV2(PhasedAlgorithm):
+class DreamerV2(AgentAlgorithm):
     """DreamerV2 with unsupervised pre-training, task-aware fine-tuning and Dyna-MPC.
 
     "Mastering the Unsupervised Reinforcement Learning Benchmark from Pixels" (ICML 2023). With an ``intrinsic_reward``
@@ -114,6 +113,8 @@ class DreamerV2(PhasedAlgorithm):
     }
     policy_class: type[DreamerPolicy]
     policy: DreamerPolicy
+    learner: Learner
+    _acting_state: ActingState | None = None
 
     @with_preset
     def __init__(
@@ -313,52 +314,14 @@ class DreamerV2(PhasedAlgorithm):
         )
         return buffer
 
-    def adams(self) -> dict[str, th.optim.Adam]:
-        """Those of the learner, by their names in snapshots."""
-        return {name: optimizer.adam for name, optimizer in self.learner.optimizers().items()}
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", *(f"learner.{name}.adam" for name in self.learner.optimizers())], []
-
-    def _guard(self) -> UpdateGuard | None:
-        learner: Learner | None = getattr(self, "learner", None)
-        return None if learner is None else learner.guard
-
     # -- acting --------------------------------------------------------------------------------------------------------
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """See :meth:`DreamerPolicy.predict`; plans if a planner is set and its time has come."""
+    def _prepare_policy(self) -> None:
         self.policy.planning = self._planner_is_on()
-        return self.policy.predict(observation, state, episode_start, deterministic)
 
     def _planner_is_on(self) -> bool:
         due = self.phase_timesteps >= self.learning_starts + self.planner_delay
         return self.planner is not None and phases.PHASES[self.phase].plans and due and self.policy.agent.trains_behavior()
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """One step of the recurrent agent; what it remembers is the action *as executed*."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        state = self._acting_state or self.policy.initial_state(n_envs)
-        self.policy.planning = self._planner_is_on()
-        with th.no_grad():
-            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
-            actions = self._random_actions(learning_starts, n_envs)
-            if actions is None:
-                state = self.policy.choose(state, deterministic=False)
-                actions = state.action.cpu().numpy()
-        actions = self._as_executed(actions, action_noise)
-        state.action = th.as_tensor(actions, device=self.device)
-        self._acting_state = state
-        return self.policy.to_env_action(actions), actions
 
     def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
         actions = super()._random_actions(learning_starts, n_envs)
@@ -425,33 +388,14 @@ class DreamerV2(PhasedAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Update on replayed sequences; does nothing while no finished episode is long enough.
-
-        :param gradient_steps: number of updates
-        :param batch_size: B
-        :raises NumericalFaultError: if losses or gradients stay non-finite
-        """
         if not self.replay_buffer.can_sample():
             arguments.check_episode_length(self.replay_buffer)
-            return
+        super().train(gradient_steps, batch_size)
+
+    def _prepare_updates(self) -> None:
         if not self.policy.agent.trains_behavior() and self.phase_timesteps > self.skill_selection_starts:
             self._choose_skill()
-        self.policy.set_training_mode(True)
-        self._set_learning_rates()
-        for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            self._metrics.add(self.learner.update(batch))
-            # While the device works on the update, and until the next one.
-            self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
-        self._n_updates += gradient_steps
-        self.phase_updates = self.learner.updates
-        self.learner.guard.stop_if_repeated(self.num_timesteps)
 
-    def _set_learning_rates(self) -> None:
-        # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.
-        remaining = max(self._current_progress_remaining, 0.0)
+    def _learning_rates(self, remaining: float) -> dict[str, float]:
         rates = {"actor_optimizer": self._actor_lr_schedule, "critic_optimizer": self._critic_lr_schedule}
-        for name, optimizer in self.learner.optimizers().items():
-            optimizer.set_learning_rate(rates.get(name, self.lr_schedule)(remaining))
-        self.logger.record("train/learning_rate", self.lr_schedule(remaining))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        return {name: rates.get(name, self.lr_schedule)(remaining) for name in self.learner.optimizers()}

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.algorithm.policy import AgentPolicy
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.nn import precision as precisions
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.planning.prepared.agent import planned
-from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
-from sb3_dreamer_urlb.snapshots.archive import Target
-from sb3_dreamer_urlb.spaces.actions import make_actions
-from sb3_dreamer_urlb.spaces.observation_checks import checked_observation
-from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations, vectors
-from sb3_dreamer_urlb.types import LatentState, Observation, batch_size
+from sb3_dreamer_urlb.spaces.observations import DictObservations, Observations, vectors
+from sb3_dreamer_urlb.types import LatentState, Observation
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
 # Deterministic predictions draw their posterior states and planning noise from seeds that begin with this number.
@@ -33,8 +29,6 @@ DETERMINISTIC_SEED = 0
 
 # Recordings of acting to keep at a time: one and ten environments, with and without exploration.
 KEPT_RECORDINGS = 4
-
-SelfDreamerPolicy = TypeVar("SelfDreamerPolicy", bound="DreamerPolicy")
 
 
 @dataclasses.dataclass
@@ -60,7 +54,7 @@ class ActingState:
         return tuple(part.cpu().numpy() for part in parts)
 
 
-class DreamerPolicy(BasePolicy):
+class DreamerPolicy(AgentPolicy[ActingState]):
     """The agent's networks behind SB3's policy interface. This class is for images; the two below it for other observations.
 
     :param observation_space: images, channels first: uint8, or floats without ``normalize_images``
@@ -84,8 +78,8 @@ class DreamerPolicy(BasePolicy):
     :raises ValueError: for spaces or sizes that do not fit
     """
 
-    #: from an observation space, and ``normalize_images``, to what the world model sees; raises UnsupportedSpaceError
-    kind_of_observations: ClassVar[Callable[..., Observations]] = Images
+    memory_parts = 6
+    agent: Agent
 
     def __init__(
         self,
@@ -108,7 +102,7 @@ class DreamerPolicy(BasePolicy):
         compile: str = "eager",
         normalize_images: bool = True,
     ):
-        super().__init__(observation_space, action_space, normalize_images=normalize_images)
+        super().__init__(observation_space, action_space, normalize_images)
         if net_arch is not None and not isinstance(net_arch, Sequence):
             raise ValueError(f"policy_kwargs: net_arch must be a sequence of widths, got {net_arch!r}.")
         net_arch = [400] * 4 if net_arch is None else list(net_arch)
@@ -124,8 +118,6 @@ class DreamerPolicy(BasePolicy):
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
         if len(net_arch) == 0:
             raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
-        self.observations = self._observations(observation_space, normalize_images)
-        self.actions = make_actions(action_space)
         if planner is not None and planner.classes != self.actions.classes:
             raise ValueError(f"The planner chooses among the classes {planner.classes}, the actions are {action_space}.")
         world_model = WorldModel(
@@ -145,20 +137,6 @@ class DreamerPolicy(BasePolicy):
         self._recorders: tuple[Recorder[ActingState], Recorder[ActingState]] | None = None
         self._recorders_device = th.device("cpu")
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "gamma": gamma, "discount_head": discount_head}
-
-    @classmethod
-    def check_spaces(
-        cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool = True
-    ) -> None:
-        """
-        :raises UnsupportedSpaceError: for a space that this policy does not take
-        """
-        cls._observations(observation_space, normalize_images)
-        make_actions(action_space)
-
-    @classmethod
-    def _observations(cls, space: spaces.Space[Any], normalize_images: bool) -> Observations:
-        return cls.kind_of_observations(space, normalize_images)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         parameters = super()._get_constructor_parameters()
@@ -185,31 +163,6 @@ class DreamerPolicy(BasePolicy):
     def planner_dtype(self) -> th.dtype:
         """Format of the planner's products."""
         return precisions.choose(self.precision, "planner", self.device, self.agent.world_model.sizes.feature)
-
-    # -- saving --------------------------------------------------------------------------------------------------------
-
-    def save(self, path: Target) -> None:
-        """Write the policy, in a form that can never run code.
-
-        :param path: path, taken as it is, or binary file object
-        """
-        policy_snapshot.save(self, path)
-
-    @classmethod
-    def load(
-        cls: type[SelfDreamerPolicy],
-        path: Target,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-    ) -> SelfDreamerPolicy:
-        """Read what :meth:`save` wrote.
-
-        :param path: path or binary file object
-        :param device: where to put it
-        :param custom_objects: constructor arguments that no file can hold, as an intrinsic reward that is not registered
-        :raises SnapshotError: naming the file and why it is refused
-        """
-        return policy_snapshot.load(cls, path, device, custom_objects)
 
     # -- acting --------------------------------------------------------------------------------------------------------
 
@@ -309,72 +262,21 @@ class DreamerPolicy(BasePolicy):
     def _skill_is_fixed(self) -> bool:
         return self.agent.skills is not None and self.agent.skills.is_fixed
 
-    # -- SB3's interface -----------------------------------------------------------------------------------------------
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Action for each observation; never changes the policy, all memory travels in ``state``.
-
-        :param observation: from the observation space, with or without leading n; uint8 images with channels first or last
-        :param state: what the last call returned; None starts afresh
-        :param episode_start: bool (n,), true where a new episode begins
-        :param deterministic: most likely action (or plan without exploration noise); draws of the posterior and the planner
-            then come from the environments' step counts, which travel in ``state``: equal inputs give equal actions, the
-            steps of an episode draw independently, and the global generators stay untouched
-        :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
-        """
-        self.set_training_mode(False)
-        tensor, vectorized = self.obs_to_tensor(checked_observation(observation, self.observation_space))
-        self.observations.check(tensor)
-        n = batch_size(tensor)
-        memory = self.initial_state(n) if state is None else self._memory(state, n)
-        starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)
-        if len(starts) != n:
-            raise ValueError(f"episode_start has {len(starts)} entries for {n} observation(s).")
-        generator = self._generator_of(None if state is None else state[-1], starts) if deterministic else None
-        is_first = th.as_tensor(starts | (state is None), device=self.device)
-        with th.no_grad():
-            memory = self.choose(self.observe(tensor, memory, is_first, generator), deterministic, generator)
-        action = self.to_env_action(memory.action.cpu().numpy())
-        return action if vectorized else action[0], memory.to_numpy()
-
-    def _generator_of(self, steps: np.ndarray | None, starts: np.ndarray) -> th.Generator:
+    def _generator_of(self, state: tuple[np.ndarray, ...] | None, starts: np.ndarray) -> th.Generator:
         """Noise of one deterministic step: its own, and the same whenever the same step is predicted.
 
         With the same numbers at every step, a planner would push each joint into one accidental direction all episode long.
 
-        :param steps: observations since each episode began, int64 (n,), on the host; None at the beginning
+        :param state: what the last call of ``predict`` returned; None at the beginning
         :param starts: where episodes begin, bool (n,)
         """
-        begun = np.zeros(len(starts), np.int64) if steps is None else np.where(starts, 0, steps)
+        begun = np.zeros(len(starts), np.int64) if state is None else np.where(starts, 0, state[-1])
         seed = np.random.SeedSequence([DETERMINISTIC_SEED, *begun.tolist()]).generate_state(1, np.uint64)[0]
         return th.Generator(self.device).manual_seed(int(seed >> np.uint64(1)))
 
-    def to_env_action(self, action: np.ndarray) -> np.ndarray:
-        """From the agent's actions, (n, A), to the action space's bounds, shape and dtype."""
-        return self.actions.to_env(action)
-
-    def _memory(self, state: tuple[np.ndarray, ...], n: int) -> ActingState:
-        if not isinstance(state, tuple) or len(state) != 6:
-            raise ValueError(f"state must be what the last predict() returned, a tuple of 6 arrays, got {type(state)}.")
-        if any(len(part) != n for part in state):
-            raise ValueError(f"state is for {[len(part) for part in state]} environments, the observation for {n}.")
-        stoch, deter, action, plan, skill, steps = (th.as_tensor(part, device=self.device) for part in state)
+    def _memory_of(self, parts: list[th.Tensor]) -> ActingState:
+        stoch, deter, action, plan, skill, steps = parts
         return ActingState(LatentState(stoch, deter), action, plan, skill, steps)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        n = batch_size(observation)
-        is_first = th.ones(n, dtype=th.bool, device=self.device)
-        return self.choose(self.observe(observation, self.initial_state(n), is_first), deterministic).action
-
-    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """The agent's actions at the beginning of an episode, (n, A)."""
-        return self._predict(observation, deterministic)
 
 
 #: the agent for images, and what users write for it

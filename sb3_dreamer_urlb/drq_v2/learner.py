@@ -30,7 +30,7 @@ class DrQLearnerConfig:
     tau: float
     noise_clip: float
     freeze_encoder: bool
-    dtype: th.dtype = th.float32
+    precision: str = "float32"
     compile: str = "eager"
 
 
@@ -45,7 +45,7 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
     """
 
     def __init__(self, agent: DrQAgent, config: DrQLearnerConfig):
-        super().__init__(agent, config.compile, config.dtype)
+        super().__init__(agent, config.compile, config.precision, width=0)
         self.config = config
         #: standard deviation of the actor's noise, on the device, so that a recorded update follows a schedule, too
         self.noise_std = th.zeros((), device=self.device)
@@ -104,14 +104,9 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
         if intrinsic is None:
             return task_reward, {}
         detached = EncodedSteps(steps.encoding.detach(), steps.action, steps.next_encoding)
-        metrics: Metrics = {}
         with self._products():
             learnt = intrinsic.loss(steps if intrinsic.trains_encoder else detached)
-        if learnt is not None and self.intrinsic_optimizer is not None:
-            loss, its = learnt
-            metrics = {f"intrinsic_{name}": value.detach() for name, value in its.items()}
-            metrics["intrinsic_grad_norm"] = self.intrinsic_optimizer.step(loss)
-            metrics["intrinsic_loss"] = loss.detach()
+        metrics = self._step_intrinsic(learnt, self.intrinsic_optimizer)
         with th.no_grad(), self._products():
             reward = intrinsic.reward(detached)
         metrics["intrinsic_reward"] = reward.mean()

@@ -14,7 +14,7 @@ from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.learning.memory import keep_freed_memory
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
-from sb3_dreamer_urlb.nn import precision
+from sb3_dreamer_urlb.nn import precision as precisions
 from sb3_dreamer_urlb.types import Metrics
 
 AnyAgent = TypeVar("AnyAgent", bound=nn.Module)
@@ -31,19 +31,21 @@ class BaseLearner(Generic[AnyAgent, Batch]):
 
     :param agent: the networks
     :param compile: how updates run, see :class:`~sb3_dreamer_urlb.DreamerV2`
-    :param dtype: format of the products in the forward and backward passes; all else is float32
+    :param precision: of the products in the forward and backward passes, see there; all else is float32
+    :param width: of the layers that most products are of, for ``precision="auto"``
     """
 
     #: what an update does on the device, recorded if that is wanted and possible
     recorder: Recorder[Metrics]
     guard: UpdateGuard
 
-    def __init__(self, agent: AnyAgent, compile: str, dtype: th.dtype):
+    def __init__(self, agent: AnyAgent, compile: str, precision: str, width: int):
         self.agent = agent
         if self.device.type == "cpu":
             keep_freed_memory()
         self._compile = compile
-        self.dtype = dtype
+        #: format of the products
+        self.dtype = precisions.choose(precision, "update", self.device, width)
         self.updates = 0
 
     def _get_ready(self, statistics: Iterable[nn.Module], recorded: nn.Module | None) -> None:
@@ -63,7 +65,7 @@ class BaseLearner(Generic[AnyAgent, Batch]):
 
     def _products(self) -> th.autocast:
         """Around every forward pass, and around nothing else: a step on a loss needs no autocast."""
-        return precision.products(self.device, self.dtype)
+        return precisions.products(self.device, self.dtype)
 
     @abstractmethod
     def optimizers(self) -> dict[str, ClippedAdam]:
@@ -99,6 +101,21 @@ class BaseLearner(Generic[AnyAgent, Batch]):
         yield from self.guard.memory()
         for optimizer in self.optimizers().values():
             yield from optimizer.memory()
+
+    @staticmethod
+    def _step_intrinsic(learnt: tuple[th.Tensor, Metrics] | None, optimizer: ClippedAdam | None) -> Metrics:
+        """What an intrinsic reward's networks learn; nothing where there is nothing to learn.
+
+        :param learnt: its loss and metrics
+        :param optimizer: its own
+        """
+        if learnt is None or optimizer is None:
+            return {}
+        loss, metrics = learnt
+        metrics = {f"intrinsic_{name}": value.detach() for name, value in metrics.items()}
+        metrics["intrinsic_grad_norm"] = optimizer.step(loss)
+        metrics["intrinsic_loss"] = loss.detach()
+        return metrics
 
     def _update(self, batch: Any, generator: th.Generator | None = None, *situation: Hashable) -> Metrics:
         with self.guard.watching():

@@ -1,8 +1,4 @@
-"""One update on one batch: losses → backward → optimiser steps. The only place that trains them.
-
-Nothing here asks the device for a value: metrics stay tensors until somebody logs them. A CUDA graph can hold all of
-:meth:`Learner._update` (graphs.py); what happens only now and then, or in Python, stands in :meth:`Learner.update`.
-"""
+"""One update of DreamerV2 on one batch: losses → backward → optimiser steps. The only place that trains its networks."""
 
 from __future__ import annotations
 
@@ -13,17 +9,13 @@ from dataclasses import dataclass, replace
 import torch as th
 from torch import nn
 
-from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
-from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
-from sb3_dreamer_urlb.learning.memory import keep_freed_memory
-from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
+from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
-from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 
@@ -51,7 +43,7 @@ class LearnerConfig:
     compile: str = "eager"
 
 
-class Learner:
+class Learner(BaseLearner[Agent, SequenceBatch]):
     """Trains an agent: intrinsic reward, world model, actor, critic.
 
     The intrinsic reward comes first because some methods label the rewards that the reward head learns. It reads what the
@@ -63,13 +55,8 @@ class Learner:
     """
 
     def __init__(self, agent: Agent, config: LearnerConfig):
-        self.agent = agent
-        if self.device.type == "cpu":
-            keep_freed_memory()
+        super().__init__(agent, config.compile, config.precision, agent.world_model.sizes.feature)
         self.config = config
-        self.updates = 0
-        #: format of the products in the forward and backward passes; all else is float32
-        self.dtype = precision.choose(config.precision, "update", self.device, agent.world_model.sizes.feature)
         self.model_optimizer = self._optimizer(agent.world_model, config.learning_rate)
         self.actor_optimizer = self._optimizer(agent.actor, config.actor_learning_rate)
         self.critic_optimizer = self._optimizer(agent.critic, config.critic_learning_rate)
@@ -80,22 +67,7 @@ class Learner:
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
         statistics = [agent.reward_normalizer, *([] if agent.intrinsic is None else [agent.intrinsic])]
-        self.guard = UpdateGuard(self.optimizers(), statistics)
-        #: what an update does on the device, recorded if that is wanted and possible
-        self.recorder: Recorder[Metrics] = Recorder(
-            self._update, make_backend(config.compile, self.device), self._memory, "The update"
-        )
-        if agent.intrinsic is not None and not agent.intrinsic.graph_safe:
-            self.recorder.give_up(f"{type(agent.intrinsic).__name__}.graph_safe is False")
-
-    @property
-    def device(self) -> th.device:
-        """Where the agent is."""
-        return next(self.agent.parameters()).device
-
-    def _products(self) -> th.autocast:
-        """Around every forward pass, and around nothing else: a step on a loss needs no autocast."""
-        return precision.products(self.device, self.dtype)
+        self._get_ready(statistics, agent.intrinsic)
 
     def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
         config = self.config
@@ -112,19 +84,9 @@ class Learner:
         }
         return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
 
-    def update(self, batch: SequenceBatch) -> Metrics:
-        """Learn from one batch; parts whose loss or gradient is not finite do not.
-
-        :param batch: (B, T, …) on the agent's device
-        :return: metrics, detached scalars on the device
-        """
-        with native.using(self.config.compile, self.device):
-            metrics = self.recorder(batch, situation=self._situation())
-        self.guard.count()
+    def _after_update(self) -> None:
         if self.trains_behavior() and self.updates % self.config.target_update_interval == 0:
             self.agent.slow_critic.load_state_dict(self.agent.critic.state_dict())
-        self.updates += 1
-        return metrics
 
     def trains_behavior(self) -> bool:
         """Whether actor and critic learn: not where nobody asks them (MPPI), nor while they have nothing to learn."""
@@ -134,17 +96,6 @@ class Learner:
         """What decides on the host which way an update goes."""
         skills = self.agent.skills
         return self.trains_behavior(), skills is not None and skills.is_fixed
-
-    def _memory(self) -> Iterator[th.Tensor]:
-        """What an update reads and writes besides the batch."""
-        yield from memory_of(self.agent)
-        yield from self.guard.memory()
-        for optimizer in self.optimizers().values():
-            yield from optimizer.memory()
-
-    def _update(self, batch: SequenceBatch, generator: th.Generator | None = None, *situation: Hashable) -> Metrics:
-        with self.guard.watching():
-            return self._update_all(batch)
 
     def _update_all(self, batch: SequenceBatch) -> Metrics:
         model = self.agent.world_model
@@ -162,13 +113,7 @@ class Learner:
     def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
         with self._products():
             learnt = self.reward_source.loss(posterior, batch)
-        if learnt is None or self.intrinsic_optimizer is None:
-            return {}
-        loss, metrics = learnt
-        metrics = {f"intrinsic_{name}": value.detach() for name, value in metrics.items()}
-        metrics["intrinsic_grad_norm"] = self.intrinsic_optimizer.step(loss)
-        metrics["intrinsic_loss"] = loss.detach()
-        return metrics
+        return self._step_intrinsic(learnt, self.intrinsic_optimizer)
 
     def _update_world_model(self, posterior: Posterior, observation: Observation, batch: SequenceBatch) -> Metrics:
         config = self.config

@@ -1,0 +1,118 @@
+"""A phased algorithm whose agent has a memory and a learner: how it acts while it learns, and when its learner updates."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.noise import ActionNoise
+
+from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
+from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
+from sb3_dreamer_urlb.learning.base import BaseLearner
+from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
+
+
+class AgentAlgorithm(PhasedAlgorithm):
+    """The part of an algorithm between its agent, its environments and its learner.
+
+    A subclass builds ``policy`` and ``learner``; it may override :meth:`_prepare_policy` and :meth:`_prepare_updates`, and
+    says with :meth:`_learning_rates` how fast each part learns.
+    """
+
+    policy: AgentPolicy[Any]
+    learner: BaseLearner[Any, Any]
+    #: what the agents in the environments remember; None at their very beginning
+    _acting_state: Memory | None = None
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def adams(self) -> dict[str, th.optim.Adam]:
+        """Those of the learner, by their names in snapshots."""
+        return {name: optimizer.adam for name, optimizer in self.learner.optimizers().items()}
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *(f"learner.{name}.adam" for name in self.learner.optimizers())], []
+
+    def _guard(self) -> UpdateGuard | None:
+        learner: BaseLearner[Any, Any] | None = getattr(self, "learner", None)
+        return None if learner is None else learner.guard
+
+    # -- acting --------------------------------------------------------------------------------------------------------
+
+    def _prepare_policy(self) -> None:
+        """Tell the policy what it should know of the run before it acts."""
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """See the policy's :meth:`~sb3_dreamer_urlb.algorithm.policy.AgentPolicy.predict`; acts as the run has come to."""
+        self._prepare_policy()
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """One step of the agent with its memory; what it remembers is the action *as executed*."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        state: Memory = self._acting_state or self.policy.initial_state(n_envs)
+        self._prepare_policy()
+        with th.no_grad():
+            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
+            actions = self._random_actions(learning_starts, n_envs)
+            if actions is None:
+                state = self.policy.choose(state, deterministic=False)
+                actions = state.action.cpu().numpy()
+        actions = self._as_executed(actions, action_noise)
+        state.action = th.as_tensor(actions, device=self.device)
+        self._acting_state = state
+        return self.policy.to_env_action(actions), actions
+
+    # -- learning ------------------------------------------------------------------------------------------------------
+
+    def _prepare_updates(self) -> None:
+        """What is due before the updates of a rollout."""
+
+    @abstractmethod
+    def _learning_rates(self, remaining: float) -> dict[str, float]:
+        """The step size of each of the learner's optimisers, by name.
+
+        :param remaining: share of the run that is left, 1 to 0
+        """
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """Update on what was replayed; does nothing while there is nothing to draw.
+
+        :param gradient_steps: number of updates
+        :param batch_size: B
+        :raises NumericalFaultError: if losses or gradients stay non-finite
+        """
+        if not self.replay_buffer.can_sample():
+            return
+        self._prepare_updates()
+        self.policy.set_training_mode(True)
+        self._set_learning_rates()
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            self._metrics.add(self.learner.update(batch))
+            # While the device works on the update, and until the next one.
+            self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
+        self._n_updates += gradient_steps
+        self.phase_updates = self.learner.updates
+        self.learner.guard.stop_if_repeated(self.num_timesteps)
+
+    def _set_learning_rates(self) -> None:
+        # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.
+        remaining = max(self._current_progress_remaining, 0.0)
+        rates = self._learning_rates(remaining)
+        for name, optimizer in self.learner.optimizers().items():
+            optimizer.set_learning_rate(rates[name])
+        self.logger.record("train/learning_rate", self.lr_schedule(remaining))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -1,0 +1,196 @@
+"""What every agent of this package is as a policy of Stable-Baselines3: it has a memory, and its files run no code."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
+from sb3_dreamer_urlb.snapshots.archive import Target
+from sb3_dreamer_urlb.spaces.actions import Actions, make_actions
+from sb3_dreamer_urlb.spaces.observation_checks import checked_observation
+from sb3_dreamer_urlb.spaces.observations import Images, Observations
+from sb3_dreamer_urlb.types import Observation, batch_size
+
+SelfAgentPolicy = TypeVar("SelfAgentPolicy", bound="AgentPolicy[Any]")
+
+
+class Memory(Protocol):
+    """What an acting agent remembers from one step to the next, for n environments."""
+
+    #: the last action, float (n, A) in [-1, 1], or one-hot
+    action: th.Tensor
+
+    def to_numpy(self) -> tuple[np.ndarray, ...]:
+        """The form that SB3 hands through ``predict(state=…)``: arrays with leading n."""
+
+
+AnyMemory = TypeVar("AnyMemory", bound=Memory)
+
+
+class AgentPolicy(BasePolicy, Generic[AnyMemory]):
+    """An agent's networks behind SB3's policy interface: observe, remember, choose.
+
+    :param observation_space: see :attr:`kind_of_observations`
+    :param action_space: what :func:`~sb3_dreamer_urlb.spaces.actions.make_actions` takes
+    :param normalize_images: False takes images of any dtype, scaled from their space's bounds instead of from [0, 255]
+    :raises ValueError: for spaces that do not fit
+    """
+
+    #: from an observation space, and ``normalize_images``, to what the agent sees; raises UnsupportedSpaceError
+    kind_of_observations: ClassVar[Callable[..., Observations]] = Images
+    #: arrays in ``predict(state=…)``
+    memory_parts: ClassVar[int]
+
+    agent: nn.Module
+
+    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool):
+        super().__init__(observation_space, action_space, normalize_images=normalize_images)
+        self.observations = self._observations(observation_space, normalize_images)
+        self.actions = self._actions(action_space)
+
+    @classmethod
+    def check_spaces(
+        cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool = True
+    ) -> None:
+        """
+        :raises UnsupportedSpaceError: for a space that this policy does not take
+        """
+        cls._observations(observation_space, normalize_images)
+        cls._actions(action_space)
+
+    @classmethod
+    def _observations(cls, space: spaces.Space[Any], normalize_images: bool) -> Observations:
+        return cls.kind_of_observations(space, normalize_images)
+
+    @classmethod
+    def _actions(cls, space: spaces.Space[Any]) -> Actions:
+        return make_actions(space)
+
+    # -- saving --------------------------------------------------------------------------------------------------------
+
+    def save(self, path: Target) -> None:
+        """Write the policy, in a form that can never run code.
+
+        :param path: path, taken as it is, or binary file object
+        """
+        policy_snapshot.save(self, path)
+
+    @classmethod
+    def load(
+        cls: type[SelfAgentPolicy],
+        path: Target,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+    ) -> SelfAgentPolicy:
+        """Read what :meth:`save` wrote.
+
+        :param path: path or binary file object
+        :param device: where to put it
+        :param custom_objects: constructor arguments that no file can hold, as an intrinsic reward that is not registered
+        :raises SnapshotError: naming the file and why it is refused
+        """
+        return policy_snapshot.load(cls, path, device, custom_objects)
+
+    # -- acting --------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def initial_state(self, n: int) -> AnyMemory:
+        """The memory of n agents that have seen nothing yet."""
+
+    @abstractmethod
+    def observe(
+        self, observation: Observation, state: AnyMemory, is_first: th.Tensor, generator: th.Generator | None = None
+    ) -> AnyMemory:
+        """Take an observation in.
+
+        :param observation: as the environment gave it, (n, …)
+        :param state: the memory before it
+        :param is_first: bool (n,), true where an episode begins
+        :param generator: source of randomness
+        """
+
+    @abstractmethod
+    def choose(self, state: AnyMemory, deterministic: bool, generator: th.Generator | None = None) -> AnyMemory:
+        """Choose the next action.
+
+        :param state: the memory after :meth:`observe`
+        :param deterministic: without exploration
+        :param generator: source of randomness
+        :return: the memory with the chosen action
+        """
+
+    @abstractmethod
+    def _memory_of(self, parts: list[th.Tensor]) -> AnyMemory:
+        """Undo ``to_numpy``."""
+
+    # -- SB3's interface -----------------------------------------------------------------------------------------------
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Action for each observation; never changes the policy, all memory travels in ``state``.
+
+        :param observation: from the observation space, with or without leading n; uint8 images with channels first or last
+        :param state: what the last call returned; None starts afresh
+        :param episode_start: bool (n,), true where a new episode begins
+        :param deterministic: the agent's best action (or plan), without exploration; whatever is drawn for it, as posterior
+            states and plans, then comes from the environments' step counts, which travel in ``state``: equal inputs give
+            equal actions, the steps of an episode draw independently, and the global generators stay untouched
+        :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
+        """
+        self.set_training_mode(False)
+        tensor, vectorized = self.obs_to_tensor(checked_observation(observation, self.observation_space))
+        self.observations.check(tensor)
+        n = batch_size(tensor)
+        memory = self.initial_state(n) if state is None else self._memory(state, n)
+        starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)
+        if len(starts) != n:
+            raise ValueError(f"episode_start has {len(starts)} entries for {n} observation(s).")
+        generator = self._generator_of(state, starts) if deterministic else None
+        is_first = th.as_tensor(starts | (state is None), device=self.device)
+        with th.no_grad():
+            memory = self.choose(self.observe(tensor, memory, is_first, generator), deterministic, generator)
+        action = self.to_env_action(memory.action.cpu().numpy())
+        return action if vectorized else action[0], memory.to_numpy()
+
+    def _generator_of(self, state: tuple[np.ndarray, ...] | None, starts: np.ndarray) -> th.Generator | None:
+        """What a deterministic prediction draws from; None for agents that draw nothing.
+
+        :param state: what the last call of ``predict`` returned; None at the beginning
+        :param starts: where episodes begin, bool (n,)
+        """
+        return None
+
+    def to_env_action(self, action: np.ndarray) -> np.ndarray:
+        """From the agent's actions, (n, A), to the action space's bounds, shape and dtype."""
+        return self.actions.to_env(action)
+
+    def _memory(self, state: tuple[np.ndarray, ...], n: int) -> AnyMemory:
+        count = self.memory_parts
+        if not isinstance(state, tuple) or len(state) != count:
+            raise ValueError(f"state must be what the last predict() returned, a tuple of {count} arrays, got {type(state)}.")
+        if any(len(part) != n for part in state):
+            raise ValueError(f"state is for {[len(part) for part in state]} environments, the observation for {n}.")
+        return self._memory_of([th.as_tensor(part, device=self.device) for part in state])
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        n = batch_size(observation)
+        is_first = th.ones(n, dtype=th.bool, device=self.device)
+        return self.choose(self.observe(observation, self.initial_state(n), is_first), deterministic).action
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """The agent's actions at the beginning of an episode, (n, A)."""
+        return self._predict(observation, deterministic)
