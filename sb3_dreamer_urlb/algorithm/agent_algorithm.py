@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,44 @@ from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
+from sb3_dreamer_urlb.types import MetricMeans
 
 
 class AgentAlgorithm(PhasedAlgorithm):
     """The part of an algorithm between its agent, its environments and its learner.
 
-    A subclass builds ``policy`` and ``learner``; it may override :meth:`_prepare_policy` and :meth:`_prepare_updates`, and
-    says with :meth:`_learning_rates` how fast each part learns.
+    A subclass says with :meth:`_new_learner` what trains the agent and with :meth:`_learning_rates` how fast; it may override
+    :meth:`_prepare_policy` and :meth:`_prepare_updates`.
     """
 
     policy: AgentPolicy[Any]
     learner: BaseLearner[Any, Any]
     #: what the agents in the environments remember; None at their very beginning
     _acting_state: Memory | None = None
+
+    # -- set-up --------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _new_learner(self) -> BaseLearner[Any, Any]:
+        """What trains ``policy``, in the current phase."""
+
+    def _build(self) -> None:
+        if getattr(self, "replay_buffer", None) is None:
+            self.replay_buffer = self._new_replay_buffer()
+        self._skipped_before = self.skipped_updates
+        self.policy = self._new_policy().to(self.device)  # type: ignore[assignment]
+        self.learner = self._new_learner()
+        self.learner.updates = self.phase_updates
+        if self.verbose >= 1:
+            for line in self._about():
+                print(line)
+        self._acting_state = None
+        self._metrics = MetricMeans()
+
+    def _about(self) -> Iterator[str]:
+        """What a user wants to know of what was built."""
+        yield f"Products of updates in {self.learner.dtype}"
+        yield f"Replay in the store {self.replay_buffer.store!r}"
 
     # -- files ---------------------------------------------------------------------------------------------------------
 

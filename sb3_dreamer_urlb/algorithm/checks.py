@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from typing import Any
 
@@ -9,7 +10,10 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_integer, is_number
+from sb3_dreamer_urlb.learning.graphs import COMPILE
+from sb3_dreamer_urlb.nn.precision import PRECISIONS
+from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 
 #: range of a number: (low, low allowed, high, high allowed)
@@ -73,6 +77,63 @@ def check_number(name: str, value: Any, bounds: Range) -> None:
     if not (is_number(value) and (low < value < high or (low_ok and value == low) or (high_ok and value == high))):
         interval = f"{'[' if low_ok else '('}{low:g}, {high:g}{']' if high_ok else ')'}"
         raise ValueError(f"{name} must lie in {interval}, got {value!r}.")
+
+
+def check_rate(name: str, value: Any) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :raises ValueError: for what is no learning rate
+    """
+    if not callable(value) and not (is_finite_number(value) and value >= 0):
+        raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+
+
+def check_switch(name: str, value: Any) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :raises ValueError: for anything but True and False
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}.")
+
+
+def check_forms(precision: Any, compile: Any) -> None:
+    """
+    :param precision: of products
+    :param compile: how updates run
+    :raises ValueError: for unknown names
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {PRECISIONS}, got {precision!r}.")
+    if compile not in COMPILE:
+        raise ValueError(f"compile must be one of {COMPILE}, got {compile!r}.")
+
+
+def check_method(intrinsic_reward: Any, phase: str) -> None:
+    """
+    :param intrinsic_reward: what was given
+    :param phase: of the model
+    :raises ValueError: if the phase needs one and there is none
+    """
+    if intrinsic_reward is None and PHASES[phase].explores:
+        raise ValueError(
+            f"A model in the phase {phase!r} needs an intrinsic_reward, got None: to move on to the task, "
+            "load it as it is and call fine_tune()."
+        )
+
+
+def check_policy_kwargs(model: SavedAlgorithm, filled_in: set[str]) -> None:
+    """
+    :param model: with its arguments, nothing built
+    :param filled_in: arguments of the policy that the algorithm fills in itself
+    :raises ValueError: for arguments that the policy has not
+    """
+    known = set(inspect.signature(model.policy_class.__init__).parameters) - filled_in
+    unknown = sorted(set(model.policy_kwargs) - known)
+    if unknown:
+        raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")
 
 
 def check_env(model: SavedAlgorithm, env: VecEnv) -> None:

@@ -36,13 +36,17 @@ class CollectingAlgorithm(SavingAlgorithm):
     #: see ``last_touches``; as of when the model itself last reset or stepped its environments
     _touches: tuple[int, ...] = ()
 
+    def _warms_up_randomly(self) -> bool:
+        """Whether the steps before this phase's first update act uniformly at random, not with the actor."""
+        return phases.PHASES[self.phase].random_warmup
+
     def _random_actions(self, learning_starts: int, n_envs: int) -> np.ndarray | None:
         """Uniformly random actions while this phase's warm-up lasts, float32 (n, A) as the agent chooses them; then None.
 
         :param learning_starts: agent steps of the warm-up
         :param n_envs: n
         """
-        if not phases.PHASES[self.phase].random_warmup or self.phase_timesteps >= learning_starts:
+        if not self._warms_up_randomly() or self.phase_timesteps >= learning_starts:
             return None
         return make_actions(self.action_space).from_env(np.stack([self.action_space.sample() for _ in range(n_envs)]))
 

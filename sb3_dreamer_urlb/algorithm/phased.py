@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.envs.touches import last_touches
-from sb3_dreamer_urlb.intrinsic import IntrinsicReward
+from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
 from sb3_dreamer_urlb.number_checks import plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
@@ -57,7 +57,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule,
         *,
-        intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None,
+        intrinsic_reward: str | type[ExplorationMethod] | ExplorationMethod | None,
         verbose: int,
         overlap: bool,
         preset: str,
@@ -180,7 +180,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         if env is not None:
             self.set_env(env)
         if keep_actor is None:
-            keep_actor = phases.keeps_actor(self.domain)
+            keep_actor = self._keeps_actor()
         pretrained = self.policy
         self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
@@ -189,6 +189,10 @@ class PhasedAlgorithm(CollectingAlgorithm):
         self._build()
         self._transfer(pretrained, keep_actor, keep_critic)
         self._last_obs = None
+
+    def _keeps_actor(self) -> bool:
+        """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule."""
+        return phases.keeps_actor(self.domain)
 
     @abstractmethod
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -13,10 +12,7 @@ from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.learning.graphs import COMPILE
-from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number
-from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
@@ -85,40 +81,30 @@ def check(model: SavedAlgorithm) -> None:
     if given.batch_length > given.buffer_size:
         raise ValueError(f"batch_length={given.batch_length} must not exceed buffer_size={given.buffer_size}.")
     for name in ("learning_rate", "actor_learning_rate", "critic_learning_rate"):
-        value = getattr(given, name)
-        if not callable(value) and not (is_finite_number(value) and value >= 0):
-            raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+        checks.check_rate(name, getattr(given, name))
     if given.discount_head is not None and not isinstance(given.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
     for name in ("overlap", "reward_trains_model"):
-        if not isinstance(getattr(given, name), bool):
-            raise ValueError(f"{name} must be True or False, got {getattr(given, name)!r}.")
+        checks.check_switch(name, getattr(given, name))
     checks.check_noise(model)
     _check_names(given, model.phase)
-    _check_policy_kwargs(model)
+    checks.check_policy_kwargs(model, POLICY_ARGUMENTS_OF_THE_MODEL)
     _check_spaces(given, model)
     if model.env is not None:
         check_episodes_fit(given.batch_length, model.replay_buffer_kwargs, model.env)
 
 
 def _check_names(given: SimpleNamespace, phase: str) -> None:
-    if given.precision not in PRECISIONS:
-        raise ValueError(f"precision must be one of {PRECISIONS}, got {given.precision!r}.")
+    checks.check_forms(given.precision, given.compile)
     if given.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
         raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {given.actor_gradient!r}.")
     if given.warmup_actions not in WARMUPS:
         raise ValueError(f"warmup_actions must be one of {WARMUPS}, got {given.warmup_actions!r}.")
-    if given.compile not in COMPILE:
-        raise ValueError(f"compile must be one of {COMPILE}, got {given.compile!r}.")
     method = given.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, given.intrinsic_kwargs)
     if intrinsic is not None:
         intrinsic.check(particles=(given.imagination_horizon + 1) * given.batch_size * given.batch_length)
-    if method is None and PHASES[phase].explores:
-        raise ValueError(
-            f"A model in the phase {phase!r} needs an intrinsic_reward, got None: to move on to the task, "
-            "load it as it is and call fine_tune()."
-        )
+    checks.check_method(method, phase)
     make_planner(given.planner, given.planner_kwargs, given.gae_lambda, classes=None)
     buffer_class = given.replay_buffer_class
     if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):
@@ -126,13 +112,6 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
             f"replay_buffer_class must be a subclass of SequenceReplayBuffer, got {buffer_class!r}: "
             "a world model learns from sequences, so SB3's transition buffers and HER do not apply."
         )
-
-
-def _check_policy_kwargs(model: SavedAlgorithm) -> None:
-    known = set(inspect.signature(model.policy_class.__init__).parameters) - POLICY_ARGUMENTS_OF_THE_MODEL
-    unknown = sorted(set(model.policy_kwargs) - known)
-    if unknown:
-        raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")
 
 
 def _check_spaces(given: SimpleNamespace, model: SavedAlgorithm) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -25,7 +26,6 @@ from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.planning import Planner, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.spaces.actions import make_actions
-from sb3_dreamer_urlb.types import MetricMeans
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
 
@@ -114,6 +114,7 @@ class DreamerV2(AgentAlgorithm):
     policy_class: type[DreamerPolicy]
     policy: DreamerPolicy
     learner: Learner
+    intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None
     _acting_state: ActingState | None = None
 
     @with_preset
@@ -238,18 +239,15 @@ class DreamerV2(AgentAlgorithm):
     def _build(self) -> None:
         intrinsic = self._intrinsic()
         self.skill_size = 0 if intrinsic is None or intrinsic.skills is None else intrinsic.skills.dim
-        if getattr(self, "replay_buffer", None) is None:
-            self.replay_buffer = self._new_replay_buffer()
-        self._skipped_before = self.skipped_updates
-        self.policy = self._new_policy().to(self.device)
-        self.learner = Learner(self.policy.agent, self._learner_config(intrinsic))
-        self.learner.updates = self.phase_updates
-        if self.verbose >= 1:
-            print(f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}")
-            print(f"Kernels: {native.describe(self.compile, self.device)}")
-            print(f"Replay in the store {self.replay_buffer.store!r}")
-        self._acting_state: ActingState | None = None
-        self._metrics = MetricMeans()
+        super()._build()
+
+    def _about(self) -> Iterator[str]:
+        yield f"Products of updates in {self.learner.dtype}, of the planner in {self.policy.planner_dtype}"
+        yield f"Kernels: {native.describe(self.compile, self.device)}"
+        yield f"Replay in the store {self.replay_buffer.store!r}"
+
+    def _new_learner(self) -> Learner:
+        return Learner(self.policy.agent, self._learner_config(self._intrinsic()))
 
     def _new_policy(self) -> DreamerPolicy:
         return self.policy_class(

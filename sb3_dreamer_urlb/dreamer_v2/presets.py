@@ -5,12 +5,10 @@ The constructor's defaults are the paper's. A preset changes some of them; whate
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
-from sb3_dreamer_urlb.number_checks import check_dict, plain
+from sb3_dreamer_urlb.algorithm.presets import find_preset, with_presets
 from sb3_dreamer_urlb.planning import Planner
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -92,35 +90,17 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
     },
 }
-#: dictionaries that a user's own extend instead of replacing them
-MERGED = ("policy_kwargs", "planner_kwargs", "replay_buffer_kwargs")
 #: what a preset proposes, and phase and intrinsic reward decide (phases.py): the argument stays None
 PROPOSED = ("ent_coef",)
 
 
-def with_preset(init: Callable[..., None]) -> Callable[..., None]:
-    """Let a constructor's ``preset`` argument replace the defaults of the arguments that the caller left out.
+def _left_alone(name: str, given: Mapping[str, Any]) -> bool:
+    # A planner that is an object has its own settings.
+    return name in PROPOSED or (name == "planner_kwargs" and isinstance(given.get("planner"), Planner))
 
-    :param init: the ``__init__`` to wrap; it keeps its signature
-    """
-    signature = inspect.signature(init)
 
-    @functools.wraps(init)
-    def wrapped(*args: Any, **kwargs: Any) -> None:
-        args, kwargs = plain(args), plain(kwargs)
-        given = signature.bind_partial(*args, **kwargs).arguments
-        preset = get_preset(given.get("preset", signature.parameters["preset"].default))
-        for name, value in preset.items():
-            if name == "planner_kwargs" and isinstance(given.get("planner"), Planner):
-                continue  # it has its own
-            if name in MERGED:
-                check_dict(name, given.get(name))
-                kwargs[name] = {**value, **(given.get(name) or {})}
-            elif name not in given and name not in PROPOSED:
-                kwargs[name] = value
-        init(*args, **kwargs)
-
-    return wrapped
+#: fills a preset's hyperparameters in where a caller of the constructor left them out
+with_preset = with_presets(PRESETS, _left_alone)
 
 
 def get_preset(name: str) -> dict[str, Any]:
@@ -128,6 +108,4 @@ def get_preset(name: str) -> dict[str, Any]:
 
     :raises ValueError: for an unknown name; the message lists the known ones
     """
-    if name not in PRESETS:
-        raise ValueError(f"Unknown preset {name!r}; known are {sorted(PRESETS)}.")
-    return PRESETS[name]
+    return find_preset(PRESETS, name)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from sb3_dreamer_urlb.agent import Agent
+from sb3_dreamer_urlb.algorithm.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
+from sb3_dreamer_urlb.algorithm.transfer import transfer as transfer_parts
 
-KEPT, ACTOR_CHOICE, CRITIC_CHOICE, FRESH = "kept", "kept if keep_actor", "kept if keep_critic", "fresh"
 #: What a fine-tuning takes over from the pre-trained agent (docs/algorithm.md, "Transfer"). Optimisers and replay always
 #: stay behind, and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
 TRANSFER: dict[str, str] = {
@@ -33,7 +34,4 @@ def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool) 
     :param keep_actor: see ``TRANSFER``
     :param keep_critic: see ``TRANSFER``
     """
-    kept = {KEPT: True, ACTOR_CHOICE: keep_actor, CRITIC_CHOICE: keep_critic, FRESH: False}
-    parts = tuple(f"{name}." for name, rule in TRANSFER.items() if kept[rule])
-    state = {name: value for name, value in source.state_dict().items() if name.startswith(parts)}
-    target.load_state_dict(state, strict=False)
+    transfer_parts(source, target, TRANSFER, keep_actor, keep_critic)
