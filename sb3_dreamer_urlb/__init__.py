@@ -1,4 +1,4 @@
-"""A Stable-Baselines3-style DreamerV2 for the Unsupervised RL Benchmark, from pixels.
+"""Stable-Baselines3-style DreamerV2 and DrQ-v2 for the Unsupervised RL Benchmark, from pixels.
 
 Importing the package registers the environments ``urlb/<domain>-<task>-v0``. The public names load on first use, so that
 who only wants an environment does not wait for torch, and the command line can still choose how torch's threads wait.
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.callbacks.videos import VideoCallback
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
     from sb3_dreamer_urlb.dreamer_v2.policies import CnnPolicy, DreamerPolicy
+    from sb3_dreamer_urlb.drq_v2 import DrQv2
     from sb3_dreamer_urlb.intrinsic import IntrinsicReward, register_intrinsic_reward
     from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError
     from sb3_dreamer_urlb.planning import Planner, PlannerConfig, register_planner
@@ -29,6 +30,7 @@ _MODULES = {
     "CnnPolicy": "dreamer_v2.policies",
     "DreamerPolicy": "dreamer_v2.policies",
     "DreamerV2": "dreamer_v2",
+    "DrQv2": "drq_v2",
     "EvaluationCallback": "callbacks.evaluation",
     "FineTuneCallback": "callbacks.phase_switch",
     "IntrinsicReward": "intrinsic",
@@ -47,6 +49,7 @@ _MODULES = {
 
 __all__ = [
     "CnnPolicy",
+    "DrQv2",
     "DreamerPolicy",
     "DreamerV2",
     "EvaluationCallback",

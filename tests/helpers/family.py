@@ -12,7 +12,7 @@ from sb3_dreamer_urlb import DreamerV2
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
 
 
-def family_model(env, policy="MlpPolicy", **kwargs):
+def family_model(env, policy="MlpPolicy", algorithm=DreamerV2, **kwargs):
     """The arguments that the family's tests pass, at our smallest size."""
     common = {
         "preset": "tiny",
@@ -23,7 +23,7 @@ def family_model(env, policy="MlpPolicy", **kwargs):
         "seed": 0,
         "device": "cpu",
     }
-    return DreamerV2(policy, env, **{**common, **kwargs})
+    return algorithm(policy, env, **{**common, **kwargs})
 
 
 def short(env_id="Pendulum-v1", steps=8):

@@ -1,0 +1,349 @@
+"""DrQv2 as an algorithm: its defaults, its frames, its noise, its phases, and runs that go on."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch as th
+from fake_envs import CounterEnv, counter
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dreamer_urlb import (
+    DreamerV2,
+    DrQv2,
+    FineTuneCallback,
+    NumericalFaultError,
+    PhaseSwitchCallback,
+    RunCheckpointCallback,
+    SnapshotCallback,
+    SnapshotError,
+)
+from sb3_dreamer_urlb.algorithm.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
+from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
+from sb3_dreamer_urlb.drq_v2.transfer import TRANSFER
+from sb3_dreamer_urlb.intrinsic import EncodedSteps, TransitionReward, register_intrinsic_reward
+from sb3_dreamer_urlb.intrinsic.registry import _REGISTRY
+
+
+def vec_env(n_envs=1, length=8, **attributes):
+    return DummyVecEnv([lambda: Monitor(CounterEnv(length, **attributes))] * n_envs)
+
+
+def tiny(env=None, policy="CnnPolicy", **kwargs):
+    return DrQv2(policy, vec_env() if env is None else env, **{"preset": "tiny", "seed": 0, "device": "cpu", **kwargs})
+
+
+def pretrained(env=None, steps=40, **kwargs):
+    return tiny(env, intrinsic_reward="disagreement", **kwargs).learn(steps)
+
+
+def parts(model, weights):
+    return {name: weights(model.policy.agent.get_submodule(name)) for name in TRANSFER if name != "intrinsic"}
+
+
+# -- arguments -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_benchmarks_defaults():
+    model = DrQv2("CnnPolicy", CounterEnv(size=84), buffer_size=1000, device="cpu")
+    agent = model.policy.agent
+    assert (model.gamma, model.tau, model.n_steps, model.batch_size, model.learning_starts) == (0.99, 0.01, 3, 256, 2000)
+    assert (model.train_freq.frequency, model.gradient_steps, model.noise_std, model.noise_clip) == (2, 1, 0.2, 0.3)
+    assert agent.encoder.convs[0].in_channels == 9 and agent.encoder.size == 39_200
+    assert [layer.out_features for layer in agent.actor.body.dense] == [1024, 1024, 2]
+    assert agent.actor.trunk[0].out_features == agent.critic.trunk[0].out_features == 50
+    assert {optimizer.learning_rate for optimizer in model.learner.optimizers().values()} == {1e-4}
+    assert all(optimizer.eps == 1e-8 and optimizer.weight_decay == 0 for optimizer in model.learner.optimizers().values())
+    assert inspect.signature(DrQv2).parameters["buffer_size"].default == 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"tau": 0.0}, r"tau must lie in \(0, 1\], got 0.0"),
+        ({"n_steps": 0}, "n_steps must be an integer of at least 1, got 0"),
+        ({"frame_stack": 0}, "frame_stack must be an integer of at least 1, got 0"),
+        ({"noise_std": -0.1}, "noise_std must be a non-negative number, or .*got -0.1"),
+        ({"noise_std": (1.0, 0.1)}, r"noise_std .*got \(1.0, 0.1\)"),
+        ({"noise_std": (1.0, 0.1, 0)}, r"noise_std .*got \(1.0, 0.1, 0\)"),
+        ({"noise_std": "linear(1,0.1,5)"}, "noise_std .*got 'linear"),
+        ({"noise_clip": float("nan")}, "noise_clip must lie in"),
+        ({"learning_rate": -1}, "learning_rate must be a non-negative number or a schedule, got -1"),
+        ({"freeze_encoder": 1}, "freeze_encoder must be True or False, got 1"),
+        ({"buffer_size": 5}, "buffer_size=5 must not be smaller than frame_stack .* 6 rows"),
+        ({"intrinsic_reward": "lbs"}, r"Unknown intrinsic_reward 'lbs'; known are \['disagreement'\].*'lbs' is for DreamerV2"),
+        ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"ensemble_size": 1}}, "ensemble_size .*got 1"),
+        ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"trains_encoder": 1}}, "trains_encoder .*got 1"),
+        ({"policy_kwargs": {"net_arch": []}}, "net_arch must name at least one hidden layer"),
+        ({"policy_kwargs": {"feature_size": 0}}, "feature_size must be a positive integer, got 0"),
+        ({"policy_kwargs": {"frame_stack": 2}}, r"Unknown policy_kwargs \['frame_stack'\]"),
+        ({"preset": "large"}, "Unknown preset 'large'; known are .*'small'"),
+        ({"precision": "half"}, "precision must be one of"),
+        ({"compile": "yes"}, "compile must be one of"),
+        ({"replay_buffer_class": dict}, "replay_buffer_class must be a subclass of NStepFrameReplayBuffer"),
+        ({"policy": "MultiInputPolicy"}, r"Unknown policy 'MultiInputPolicy'; known are \['CnnPolicy', 'MlpPolicy'\]"),
+    ],
+)
+def test_bad_arguments_are_named(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        tiny(**kwargs)
+
+
+def test_dreamer_v2_says_whose_method_disagreement_is():
+    with pytest.raises(ValueError, match=r"Unknown intrinsic_reward 'disagreement'.*is for DrQv2"):
+        DreamerV2("CnnPolicy", CounterEnv(), preset="tiny", intrinsic_reward="disagreement")
+
+
+def test_discrete_actions_are_refused():
+    with pytest.raises(ValueError, match=r"DrQv2 needs a Box action space, got Discrete\(3\)"):
+        tiny(CounterEnv(action_space=spaces.Discrete(3)))
+
+
+# -- frames ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_it_acts_on_the_stacks_that_it_learns_from(n_envs):
+    """Every stack that the policy saw while collecting is one that replay gives for that step."""
+    model = tiny(vec_env(n_envs, [3, 5, 9]), learning_starts=0, frame_stack=3)
+    seen = {}
+    original = model.policy.observe
+
+    def spy(*args, **kwargs):
+        memory = original(*args, **kwargs)
+        for stack in memory.frames.numpy():
+            seen.setdefault(tuple(counter(stack)), 0)
+        return memory
+
+    model.policy.observe = spy
+    model.learn(40)
+    batch = model.replay_buffer.sample(500)
+    drawn = {tuple(counter(stack)) for stack in batch.observation.numpy()}
+    assert drawn <= set(seen)
+    # The first stack of an episode holds its first frame only, later ones run on.
+    assert any(len(set(stack)) == 1 for stack in drawn)
+    assert all(later - earlier in (0, 1) for stack in drawn for earlier, later in pairwise(stack))
+
+
+def test_predict_hands_the_frames_on():
+    model = tiny(frame_stack=3)
+    frames = [np.full((16, 16, 3), value, np.uint8) for value in (10, 20, 30, 40)]
+    state, start = None, np.ones(1, bool)
+    for frame in frames:
+        action, state = model.predict(frame, state, start, deterministic=True)
+        start = np.zeros(1, bool)
+    assert state[0][0, :, 0, 0, 0].tolist() == [20, 30, 40]
+    stack = th.from_numpy(np.stack(frames[1:]).transpose(0, 3, 1, 2)[None])
+    agent = model.policy.agent
+    expected = agent.actor(agent.encode(stack), th.zeros(())).mean
+    assert np.allclose(action, expected.detach().numpy()[0], atol=1e-6)
+    _, fresh = model.predict(frames[0], state, np.ones(1, bool), deterministic=True)
+    assert fresh[0][0, :, 0, 0, 0].tolist() == [10, 10, 10]
+
+
+def test_evaluate_policy_is_repeatable():
+    model = tiny().learn(30)
+    env = vec_env(2)
+    first, second = (evaluate_policy(model, env, 4, return_episode_rewards=True) for _ in range(2))
+    assert first == second and first[1] == [8] * 4
+
+
+def test_the_policy_alone_is_saved_and_loaded(tmp_path):
+    model = tiny(frame_stack=2, noise_std=0.0)
+    model.policy.save(tmp_path / "policy")
+    policy = DrQPolicy.load(tmp_path / "policy", device="cpu")
+    frame = model.observation_space.sample()
+    assert policy.frame_stack == 2 and policy.noise_std == 0
+    assert np.array_equal(policy.predict(frame)[0], model.predict(frame)[0])
+
+
+def test_vectors_have_one_frame_and_images_three():
+    vector = spaces.Box(-1, 1, (4,), np.float32)
+    assert tiny(CounterEnv(observation_space=vector), "MlpPolicy").policy.frame_stack == 1
+    assert tiny().policy.frame_stack == 3
+    stacked = tiny(CounterEnv(8, observation_space=vector), "MlpPolicy", frame_stack=2).learn(40)
+    assert stacked.policy.agent.encoder.size == 8 and stacked._n_updates > 0
+
+
+# -- exploration -----------------------------------------------------------------------------------------------------------
+
+
+def test_noise_falls_as_scheduled_when_acting_and_when_learning():
+    model = tiny(noise_std=(1.0, 0.2, 40))
+    seen = []
+
+    def look(*_):
+        seen.append((model.policy.noise_std, float(model.learner.noise_std)))
+        return True
+
+    model.learn(60, callback=look)
+    acting = [std for std, _ in seen]
+    assert acting[0] == 1.0 and acting[20] == pytest.approx(0.6) and acting[-1] == pytest.approx(0.2)
+    assert seen[-1][1] == pytest.approx(0.2)
+    model.predict(np.zeros((16, 16, 3), np.uint8))
+    assert model.policy.noise_std == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("phase", ["pretraining", "finetuning"])
+def test_each_phase_begins_with_random_actions(phase):
+    model = tiny(intrinsic_reward="disagreement", noise_std=0.0, learning_starts=12)
+    if phase == "finetuning":
+        model.learn(20)
+        model.fine_tune()
+    sampled = []
+    original = model.action_space.sample
+    model.action_space.sample = lambda: sampled.append(model.phase_timesteps) or original()
+    model.learn(20)
+    assert sampled == list(range(12))
+
+
+# -- phases ----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_table_names_every_part_of_the_agent():
+    names = set(pretrained().policy.agent.state_dict())
+    assert all(name.startswith(tuple(f"{part}." for part in TRANSFER)) for name in names)
+    assert TRANSFER["encoder"] == TRANSFER["critic.trunk"] == KEPT and TRANSFER["actor"] == ACTOR_CHOICE
+
+
+@pytest.mark.parametrize("keep_actor", [None, True, False])
+@pytest.mark.parametrize("keep_critic", [True, False])
+@pytest.mark.parametrize("through_a_file", [True, False])
+def test_transfer(weights, tmp_path, keep_actor, keep_critic, through_a_file):
+    model = pretrained(vec_env(domain="jaco"))
+    before = parts(model, weights)
+    if through_a_file:
+        model.save(tmp_path / "snapshot")
+        model = DrQv2.load(tmp_path / "snapshot", env=vec_env(domain="jaco"), device="cpu")
+    model.fine_tune(keep_actor=keep_actor, keep_critic=keep_critic)
+    # The benchmark keeps the actor in every domain.
+    kept = {KEPT: True, FRESH: False, ACTOR_CHOICE: keep_actor is not False, CRITIC_CHOICE: keep_critic}
+    after = parts(model, weights)
+    for name, rule in TRANSFER.items():
+        if name not in ("intrinsic", "target_critic"):
+            changed = {tensor for tensor in before[name] if before[name][tensor] != after[name][tensor]}
+            assert bool(changed) != kept[rule], name
+    agent = model.policy.agent
+    assert agent.intrinsic is None and weights(agent.critic) == weights(agent.target_critic)
+    assert set(model.learner.optimizers()) == {"actor_optimizer", "critic_optimizer"}
+    assert not any(optimizer.state_dict()["state"] for optimizer in model.learner.optimizers().values())
+    assert model.replay_buffer.size() == 0 and model.phase == "finetuning"
+    model.learn(30)
+
+
+def test_rewards_of_the_task_do_not_reach_a_pre_training_agent(weights):
+    def learn(scale, **kwargs):
+        return weights(tiny(vec_env(rewards=[scale, -scale]), **kwargs).learn(60).policy)
+
+    assert learn(0.1, intrinsic_reward="disagreement") == learn(5.0, intrinsic_reward="disagreement")
+    assert learn(0.1) != learn(5.0)
+
+
+def test_freeze_encoder_is_for_fine_tuning(weights):
+    model = tiny(intrinsic_reward="disagreement", freeze_encoder=True)
+    fresh = weights(model.policy.agent.encoder)
+    model.learn(40)
+    before = weights(model.policy.agent.encoder)
+    assert before != fresh
+    model.fine_tune()
+    critic = weights(model.policy.agent.critic)
+    model.learn(40)
+    assert weights(model.policy.agent.encoder) == before and weights(model.policy.agent.critic) != critic
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_switch_within_one_learn(other):
+    env = vec_env(2, action_repeat=2)
+    target = vec_env(2, action_repeat=3) if other else None
+    phases = []
+    model = tiny(env, intrinsic_reward="disagreement")
+    switch = PhaseSwitchCallback(80, target)
+    look = ConvertCallback(lambda *_: phases.append((model.phase, model.phase_frames)) or True)
+    model.learn(120, callback=[look, switch])
+    assert ("pretraining", 80) in phases and phases[-1][0] == "finetuning"
+    assert phases[-1][1] == (120 - 40) * (3 if other else 2) and model.pretrained_frames == 80
+    assert model.replay_buffer.phase == "finetuning" and model.phase_updates > 0
+
+
+def test_a_snapshot_is_fine_tuned_by_callback(tmp_path, weights):
+    model = tiny(intrinsic_reward="disagreement")
+    model.learn(40, callback=SnapshotCallback(tmp_path, frames=[20, 40]))
+    loaded = DrQv2.load(tmp_path / "snapshot_40.zip", env=vec_env(), device="cpu")
+    before = weights(loaded.policy.agent.encoder)
+    loaded.learn(8, callback=FineTuneCallback(verbose=0))
+    assert loaded.phase == "finetuning" and weights(loaded.policy.agent.encoder) == before
+
+
+class Constant(TransitionReward):
+    """A toy method from outside the package.
+
+    :param value: what every step is worth
+    """
+
+    def __init__(self, value: float = 2.0):
+        super().__init__()
+        self.value = value
+
+    def reward(self, steps: EncodedSteps) -> th.Tensor:
+        return th.full_like(steps.action[:, 0], self.value)
+
+
+@pytest.mark.parametrize("method", ["constant", Constant, Constant(2.0)])
+def test_a_method_from_outside(monkeypatch, tmp_path, method):
+    monkeypatch.delitem(_REGISTRY, "constant", raising=False)
+    register_intrinsic_reward("constant", Constant)
+    try:
+        model = tiny(intrinsic_reward=method).learn(24)
+        assert model._metrics.take()["intrinsic_reward"] == 2.0
+        model.save(tmp_path / "model")
+        assert DrQv2.load(tmp_path / "model", device="cpu").policy.agent.intrinsic.value == 2.0
+    finally:
+        del _REGISTRY["constant"]
+
+
+# -- files and runs --------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_of_the_other_algorithm_is_refused(tmp_path):
+    tiny().save(tmp_path / "drq")
+    with pytest.raises(SnapshotError, match="which DreamerV2 has not"):
+        DreamerV2.load(tmp_path / "drq", device="cpu")
+
+
+@pytest.mark.parametrize("intrinsic", [None, "disagreement"])
+def test_a_resumed_run_goes_on_the_same_way_each_time(tmp_path, weights, intrinsic):
+    keep = {"every_frames": 16, "handle_signals": False}
+    model = tiny(intrinsic_reward=intrinsic).learn(40, RunCheckpointCallback(tmp_path / "run", **keep))
+    found = []
+    for number in range(2):
+        folder = shutil.copytree(tmp_path / "run", tmp_path / str(number))
+        resumed = DrQv2.resume(folder, vec_env(), device="cpu")
+        assert weights(resumed.policy) == weights(model.policy) and resumed.replay_buffer.size() > 0
+        assert resumed.num_timesteps == 40 and resumed._n_updates == model._n_updates
+        resumed.learn(40, RunCheckpointCallback(folder, **keep), reset_num_timesteps=False)
+        found.append(weights(resumed.policy))
+    assert found[0] == found[1] != weights(model.policy)
+
+
+def test_overlap_changes_nothing(weights):
+    assert weights(tiny(overlap=True).learn(60).policy) == weights(tiny(overlap=False).learn(60).policy)
+
+
+def test_the_store_on_the_device_changes_nothing(weights):
+    def learn(store):
+        return weights(tiny(replay_buffer_kwargs={"store": store}).learn(40).policy)
+
+    assert learn("memory") == learn("device")
+
+
+def test_a_run_that_no_longer_learns_ends(tmp_path):
+    with pytest.raises(NumericalFaultError, match="critic"):
+        tiny(vec_env(rewards=[3e38]), tensorboard_log=str(tmp_path), train_freq=1).learn(200)
