@@ -176,7 +176,10 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :raises ValueError: if the model is not pre-training
         """
         if self.phase != phases.PRETRAINING:
-            raise ValueError(f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}.")
+            raise ValueError(
+                f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}: "
+                "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
+            )
         if env is not None:
             self.set_env(env)
         if keep_actor is None:

@@ -120,7 +120,8 @@ class SavingAlgorithm(RunningAlgorithm):
     def save_replay_buffer(self, path: Target) -> None:
         """Write the replay, open episodes included, in a form that can never run code.
 
-        :param path: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
+        :param path: path (``.zip`` is added where it has no suffix), or binary file object
+        :raises FileExistsError: where a model or a policy is kept under that name
         """
         replay_snapshot.save(self.replay_buffer, path)
 

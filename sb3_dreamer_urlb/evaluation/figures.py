@@ -14,8 +14,9 @@ from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import pictures, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
+from sb3_dreamer_urlb.version import how_to_install
 
-MISSING_PLOTS = "Pictures need matplotlib and pillow: pip install 'sb3_dreamer_urlb[plots]'."
+MISSING_PLOTS = f"Pictures need matplotlib and pillow; {how_to_install('plots')}."
 CONTEXT = 5  # observations the model sees before it predicts on its own
 
 

@@ -43,12 +43,13 @@ class Recording:
     fps: float
 
 
-def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None) -> VecEnv:
+def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None, argument: str = "env") -> VecEnv:
     """An environment as the model takes it: vectorised, normalised with the model's own statistics.
 
     :param model: that is to play
     :param env: VecEnv of one environment, used as it is; an environment or its id; None makes another one of the same id
         and arguments as the model's first
+    :param argument: what the caller's user calls ``env``, for messages
     :raises ValueError: if it does not fit the model, or no environment can be made
     """
     origin = ""
@@ -56,8 +57,8 @@ def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None) -> VecEnv:
         vec_env = env
     else:
         if env is None:
-            env = _same_again(model)
-            origin = " It lacks the wrappers of the training environment: give env."
+            env = _same_again(model, argument)
+            origin = f" It lacks the wrappers of the training environment: give {argument}."
         elif isinstance(env, str):
             env = gymnasium.make(env, render_mode="rgb_array")
         monitored = env if is_wrapped(env, Monitor) else Monitor(env)
@@ -72,11 +73,11 @@ def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None) -> VecEnv:
     return vec_env
 
 
-def _same_again(model: DreamerV2) -> gymnasium.Env[Any, Any]:
+def _same_again(model: DreamerV2, argument: str) -> gymnasium.Env[Any, Any]:
     train_env = model.get_env()
     spec = None if train_env is None else env_attribute(train_env, "spec", None)
     if train_env is None or spec is None:
-        raise ValueError("Another environment like the model's cannot be made, as it has no registered id: give env.")
+        raise ValueError(f"Another environment like the model's cannot be made, as it has no registered id: give {argument}.")
     kwargs = {**spec.kwargs}
     if "rgb_array" in env_attribute(train_env, "metadata", {}).get("render_modes", ()):
         kwargs["render_mode"] = "rgb_array"

@@ -16,7 +16,7 @@ from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.version import __version__
+from sb3_dreamer_urlb.version import __version__, how_to_install
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -147,7 +147,7 @@ def model_card(
     :param model: trained
     :param facts: about it
     :param evaluation: its return
-    :param repo_name: where it will be found
+    :param repo_name: where it will be found, ``"./"`` for the folder that the card lies in
     :param normalized: there is a ``vec_normalize.json``
     :param filmed: there is a ``replay.mp4``
     """
@@ -181,9 +181,8 @@ A world model with an actor, trained with sb3_dreamer_urlb, DreamerV2 for
 
 ## Use it
 
-```sh
-pip install 'sb3_dreamer_urlb[hub]'
-```
+sb3_dreamer_urlb {__version__} or later; {how_to_install("hub").replace("pip", "`pip")}`.
+{"Then, in this folder:" if repo_name == "./" else "Then:"}
 
 ```python
 {usage(facts, repo_name, normalized)}
@@ -221,14 +220,19 @@ def frames_text(facts: ModelFacts) -> str:
 
 def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
     """Python that loads the model."""
+    registers, known = who_registers(facts.env_id)
+    env_id = json.dumps(facts.env_id)
+    if not known:
+        registers = ["# No package registers this environment: get its class from whoever made the model.",
+                     f"from its_module import ItsClass  # {facts.env_id}"]  # fmt: skip
     if normalized:
-        imports = ["from stable_baselines3.common.env_util import make_vec_env"]
+        imports = [*registers, "from stable_baselines3.common.env_util import make_vec_env"]
         names = "load_from_hub, load_vec_normalize"
         statistics = f'load_from_hub({json.dumps(repo_name)}, "vec_normalize.json")'
-        env = f"load_vec_normalize({statistics}, make_vec_env({json.dumps(facts.env_id)}))"
+        env = f"load_vec_normalize({statistics}, make_vec_env({env_id if known else 'ItsClass'}))"
     else:
-        imports, names = ["import gymnasium"], "load_from_hub"
-        env = f"gymnasium.make({json.dumps(facts.env_id)})"
+        imports, names = [*(["import gymnasium"] if known else []), *registers], "load_from_hub"
+        env = f"gymnasium.make({env_id})" if known else "ItsClass()"
     lines = [
         *imports,
         "",
@@ -241,6 +245,19 @@ def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
     if facts.phase == PRETRAINING:
         lines += ["model.fine_tune()  # keeps what was pre-trained", "model.learn(50_000)"]
     return "\n".join(lines)
+
+
+def who_registers(env_id: str) -> tuple[list[str], bool]:
+    """Imports without which ``gymnasium.make`` would not know an environment, and whether there are such."""
+    spec = gymnasium.registry.get(env_id)
+    if spec is None:
+        return [], False
+    entry = spec.entry_point
+    module = entry.partition(":")[0] if isinstance(entry, str) else getattr(entry, "__module__", "")
+    package = module.partition(".")[0]
+    if package in ("", "__main__", "builtins"):
+        return [], False
+    return ([] if package in ("gymnasium", "sb3_dreamer_urlb") else [f"import {package}  # registers {env_id}"]), True
 
 
 def changed_arguments(model: DreamerV2) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from tqdm import tqdm
 
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation import recording
@@ -48,6 +49,7 @@ def package_to_hub(
     token: str | None = None,
     private: bool | None = None,
     extra_files: Mapping[str, str | os.PathLike[str]] | None = None,
+    progress_bar: bool = False,
 ) -> str:
     """Evaluate a model, film it, describe it, and put all of it into a repository.
 
@@ -69,15 +71,18 @@ def package_to_hub(
     :param token: of the Hub; None takes the one of ``hf auth login``, or ``HF_TOKEN``
     :param private: whether a repository that is made on the Hub is private
     :param extra_files: further files, by their names in the repository
+    :param progress_bar: show how many episodes of the evaluation are played
     :return: where to look at it
-    :raises ValueError: for arguments that make no sense, an environment that does not fit, weights that are not finite
+    :raises ValueError: for arguments that make no sense, an environment that does not fit, weights that are not finite; what
+        only the caller can give, and has not, is named all at once
     :raises ImportError: if the extra ``hub`` is not installed
     """
     check_integer("n_eval_episodes", n_eval_episodes, 1)
     check_integer("video_length", video_length, 0)
     check_installed(film=video_length > 0)
     repository = open_repository(repo_id, token, private=private)
-    env = recording.env_to_play_in(model, eval_env)
+    _check_given(model, eval_env, env_id, extra_files or {})
+    env = recording.env_to_play_in(model, eval_env, argument="eval_env")
     try:
         recording.copy_statistics(model, env)
         env_id = env_id or _id_of(env)
@@ -85,13 +90,13 @@ def package_to_hub(
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
             model.save(folder / model_file)
-            evaluation = _evaluate(model, env, n_eval_episodes, deterministic)
+            evaluation = _evaluate(model, env, n_eval_episodes, deterministic, progress_bar)
             filmed = video_length > 0 and _film(model, env, video_length, deterministic, folder / FILM)
             normalizer = unwrap_vec_normalize(env)
             if normalizer is not None:
                 save_vec_normalize(normalizer, folder / STATISTICS)
             facts = cards.facts_about(model, env_id, command)
-            card = cards.model_card(model, facts, evaluation, repository.name, normalizer is not None, filmed)
+            card = cards.model_card(model, facts, evaluation, repository.shown, normalizer is not None, filmed)
             (folder / CARD).write_text(card)
             (folder / CONFIG).write_text(json.dumps(cards.config(facts, model_file), indent=1))
             (folder / RESULTS).write_text(json.dumps(asdict(evaluation), indent=1))
@@ -166,6 +171,32 @@ def check_installed(film: bool) -> None:
         raise ImportError(MISSING_HUB)
 
 
+def _check_given(
+    model: DreamerV2, eval_env: GymEnv | str | None, env_id: str | None, extra_files: Mapping[str, str | os.PathLike[str]]
+) -> None:
+    """
+    :raises ValueError: naming everything that is missing
+    """
+    missing = []
+    if eval_env is None and (model.get_env() is None or _spec_of(model.get_env()) is None):
+        missing.append("eval_env, an environment to evaluate in (the model has none that could be made again by its id)")
+    if (
+        env_id is None
+        and not isinstance(eval_env, str)
+        and _spec_of(eval_env if eval_env is not None else model.get_env()) is None
+    ):
+        missing.append("env_id, the environment's name for the card (it has no registered id: give env_id)")
+    missing += [
+        f"the extra file {name!r}: there is no {path}" for name, path in extra_files.items() if not Path(path).is_file()
+    ]
+    if missing:
+        raise ValueError(f"package_to_hub needs {'; and '.join(missing)}.")
+
+
+def _spec_of(env: GymEnv | None) -> Any:
+    return env_attribute(env, "spec", None) if isinstance(env, VecEnv) else getattr(env, "spec", None)
+
+
 def _id_of(env: VecEnv) -> str:
     spec = env_attribute(env, "spec", None)
     if spec is None:
@@ -173,8 +204,16 @@ def _id_of(env: VecEnv) -> str:
     return str(spec.id)
 
 
-def _evaluate(model: DreamerV2, env: VecEnv, episodes: int, deterministic: bool) -> cards.Evaluation:
-    mean, std = evaluate_policy(model, env, n_eval_episodes=episodes, deterministic=deterministic)
+def _evaluate(
+    model: DreamerV2, env: VecEnv, episodes: int, deterministic: bool, progress_bar: bool = False
+) -> cards.Evaluation:
+    with tqdm(total=episodes, desc="Evaluating", unit="episode", disable=not progress_bar) as bar:
+
+        def played(places: dict[str, Any], _: dict[str, Any]) -> None:
+            bar.update(int(sum(places["episode_counts"])) - bar.n)
+
+        mean, std = evaluate_policy(model, env, n_eval_episodes=episodes, deterministic=deterministic, callback=played)
+        bar.update(episodes - bar.n)
     assert isinstance(mean, float)
     now = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return cards.Evaluation(float(mean), float(np.mean(std)), episodes, deterministic, now)

@@ -9,11 +9,11 @@ from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlsplit
 
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
-from sb3_dreamer_urlb.version import __version__
+from sb3_dreamer_urlb.version import __version__, how_to_install
 
 RepoId = str | os.PathLike[str]
 
-MISSING_HUB = "Sharing models needs huggingface_hub and imageio-ffmpeg: pip install 'sb3_dreamer_urlb[hub]'."
+MISSING_HUB = f"Sharing models needs huggingface_hub and imageio-ffmpeg; {how_to_install('hub')}."
 LIBRARY = "sb3_dreamer_urlb"
 #: what the Hub allows, roughly; it says itself what exactly is wrong with a name
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
@@ -23,10 +23,11 @@ class Repository(ABC):
     """Files by name.
 
     :param name: for people, and for ``load_from_hub``
+    :param shown: the same as a reader of the model card writes it, who may be at another machine
     """
 
-    def __init__(self, name: str):
-        self.name = name
+    def __init__(self, name: str, shown: str):
+        self.name, self.shown = name, shown
 
     @abstractmethod
     def upload(self, folder: Path, message: str) -> str:
@@ -54,8 +55,8 @@ class FolderRepository(Repository):
     """
 
     def __init__(self, folder: Path):
-        # The card names it to readers whose working directory is another.
-        super().__init__(str(folder.absolute()))
+        # Folders are copied, and disks are mounted elsewhere: the card lies in the folder, and so does its reader.
+        super().__init__(str(folder.absolute()), "./")
         self.folder = folder
         if folder.exists() and not folder.is_dir():
             raise ValueError(f"A repository is a folder, {folder} is a file.")
@@ -85,7 +86,7 @@ class HubRepository(Repository):
     """
 
     def __init__(self, repo_id: str, token: str | None, revision: str | None, private: bool | None):
-        super().__init__(repo_id)
+        super().__init__(repo_id, repo_id)
         try:
             from huggingface_hub import HfApi
         except ImportError as error:

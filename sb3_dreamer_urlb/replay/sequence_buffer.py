@@ -57,7 +57,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param skill_size: W, size of the skills to store with each row, 0 for none
     :param store: ``"memory"``; ``"device"`` for the memory of ``device``, so that batches need not go there; ``"auto"`` for
         the latter on CUDA if ``buffer_size`` rows fit, else the former; or ``"lmdb"`` for a file that survives the process
-        (``pip install 'sb3_dreamer_urlb[lmdb]'``). Open episodes are in memory in any case
+        (``pip install '.[lmdb]'``). Open episodes are in memory in any case
     :param path: folder of the file; each phase has its own in it. Rows that an earlier run left there are taken over
     :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
     :param prefetch: let a thread gather the next batch and bring it to the device while something else goes on

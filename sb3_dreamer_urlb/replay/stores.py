@@ -16,6 +16,8 @@ from pathlib import Path
 
 import torch as th
 
+from sb3_dreamer_urlb.version import how_to_install
+
 AUTO, MEMORY, DEVICE, LMDB = STORES = ("auto", "memory", "device", "lmdb")
 #: of a device's free memory, what ``"auto"`` takes for the replay; the rest is for networks and updates
 DEVICE_SHARE = 0.6
@@ -35,9 +37,7 @@ def check_store(store: str, path: str | os.PathLike[str] | None, map_size: int |
         try:
             import lmdb  # noqa: F401
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                f"store='lmdb' needs a package: pip install 'sb3_dreamer_urlb[lmdb]' ({error})"
-            ) from None
+            raise ModuleNotFoundError(f"store='lmdb' needs a package; {how_to_install('lmdb')} ({error})") from None
 
 
 def choose(store: str, device: th.device, needed: int) -> str:

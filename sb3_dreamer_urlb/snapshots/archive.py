@@ -107,9 +107,11 @@ def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
     :param target: path, or binary file object
     :param kind: see :class:`Writer`
     :param suffix: added to a path that has none
+    :raises FileExistsError: where a file of another kind is: all of them end in ``.zip``
     """
     if isinstance(target, str | os.PathLike):
         path = path_to_write(target, suffix) if suffix else Path(target)
+        _check_no_other_kind(path, kind)
         with written_atomically(path) as file, Writer(file, kind) as writer:
             yield writer
     elif hasattr(target, "write"):
@@ -117,6 +119,16 @@ def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
             yield writer
     else:
         raise TypeError(f"Expected a path or a binary file object to save to, got {target!r}.")
+
+
+def _check_no_other_kind(path: Path, kind: str) -> None:
+    try:
+        with zipfile.ZipFile(path) as file:
+            there = bounded_json.parse(file.read(MANIFEST)).get("kind")
+    except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile):
+        return
+    if there in ("model", "policy", "replay") and there != kind:
+        raise FileExistsError(17, f"A {kind} does not take the place of a {there}: choose another name", str(path))
 
 
 class Archive:

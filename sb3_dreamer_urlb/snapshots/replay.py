@@ -5,7 +5,9 @@ Each ``rows-…`` member holds whole episodes: their lengths and, one after the 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,7 @@ def save(buffer: SequenceReplayBuffer, target: Target) -> None:
     """Write a whole replay buffer.
 
     :param buffer: open episodes are stored, too
-    :param target: path (``.pkl`` is added where it has no suffix, as SB3's callbacks name it), or binary file object
+    :param target: path (``.zip`` is added where it has no suffix), or binary file object
     """
     write(buffer, target, [*buffer.episodes, *(episode for episode in buffer.open if episode is not None)])
 
@@ -41,7 +43,7 @@ def write(buffer: SequenceReplayBuffer, target: Target, episodes: Iterable[Episo
     :param target: see :func:`save`
     :param episodes: in their order
     """
-    with writing(target, KIND, suffix="pkl") as writer:
+    with writing(target, KIND) as writer:
         for number, group in enumerate(_groups(episodes)):
             writer.add(f"rows-{number:06d}.safetensors", _pack(buffer, group))
         writer.finish(
@@ -87,7 +89,9 @@ def load(buffer: SequenceReplayBuffer, source: Target) -> None:
     :param source: path or binary file object
     :raises SnapshotError: naming the file and why it is refused
     """
-    with reading(source, KIND, suffix="pkl") as archive:
+    if isinstance(source, str | os.PathLike):
+        source = _as_it_was_named(Path(source))
+    with reading(source, KIND) as archive:
         if buffer.path is not None:
             raise ValueError(f"the model keeps its replay on disk, in {buffer.path}, and takes no other")
         data = _checked_data(buffer, archive)
@@ -98,6 +102,13 @@ def load(buffer: SequenceReplayBuffer, source: Target) -> None:
         finished = episodes[: len(episodes) - count]
         restore(buffer, finished, episodes[len(finished) :], data)
         set_generator(buffer.rng, data["sampler"])
+
+
+def _as_it_was_named(path: Path) -> Path:
+    """Files had the ending ``.pkl`` until version 0.1, as SB3's have, though they never were pickles."""
+    old = path.with_name(f"{path.name}.pkl")
+    there = path.exists() or path.suffix or path.with_name(f"{path.name}.zip").exists()
+    return old if not there and old.exists() else path
 
 
 def load_some(buffer: SequenceReplayBuffer, source: Target) -> list[Episode]:

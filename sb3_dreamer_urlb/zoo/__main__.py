@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import runpy
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 from unittest import mock
+
+from sb3_dreamer_urlb.version import how_to_install
 
 COMMANDS = {
     "train": "train, go on with a run or from a snapshot (-i), search for hyperparameters (-optimize)",
@@ -41,24 +46,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         # Heavy imports only now, so that --help answers at once.
         import rl_zoo3
+        import rl_zoo3.utils
 
         from sb3_dreamer_urlb.zoo.registration import register
         from sb3_dreamer_urlb.zoo.resuming import with_runs
     except ModuleNotFoundError as error:
-        print(f"{parser.prog}: {error}; pip install 'sb3_dreamer_urlb[zoo]'", file=sys.stderr)
+        print(f"{parser.prog}: {error}; {how_to_install('zoo')}", file=sys.stderr)
         return 2
     assert rl_zoo3.ALGOS
     register()
     if command == "plot":
-        _plot(rest)
-        return 0
+        return _plot(rest)
     if command.endswith("_hub"):
         return _share(command, rest, f"{parser.prog} {command}")
     if command == "enjoy" and not _has_display() and "--no-render" not in rest and "-h" not in rest:
         print("No display: playing without a window (--no-render); record_video makes a film.")
         rest = [*rest, "--no-render"]
     sys.argv = [f"{parser.prog} {command}", *rest]
-    with mock.patch.object(argparse.ArgumentParser, "parse_args", with_runs(argparse.ArgumentParser.parse_args)):
+    with (
+        mock.patch.object(argparse.ArgumentParser, "parse_args", with_runs(argparse.ArgumentParser.parse_args)),
+        mock.patch("rl_zoo3.utils.get_model_path", _that_says_what_there_is(rl_zoo3.utils.get_model_path, sys.argv[0])),
+    ):
         runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
     return 0
 
@@ -78,14 +86,37 @@ def _share(command: str, rest: list[str], prog: str) -> int:
     return 0
 
 
-def _plot(rest: list[str]) -> None:
+def _that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callable[..., Any]:
+    """rl_zoo3's look for a trained model; one that is not there costs a line, with those that are, in place of a traceback."""
+
+    @functools.wraps(original)
+    def get_model_path(exp_id: int, folder: str, algo: str, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return original(exp_id, folder, algo, *args, **kwargs)
+        except (AssertionError, ValueError) as error:
+            if algo != "dreamerv2":
+                raise
+            runs = sorted(path.name for path in Path(folder, algo).glob("*") if path.is_dir())
+            there = (
+                f"runs in {Path(folder, algo)}: {', '.join(runs)}" if runs else f"no run in {Path(folder, algo)} (-f names it)"
+            )
+            print(f"{prog}: {str(error).rstrip('.')}; {there}", file=sys.stderr)
+            raise SystemExit(2) from error
+
+    return get_model_path
+
+
+def _plot(rest: list[str]) -> int:
     """rl_zoo3's learning curves, also into a file, also with an environment's id as the other commands take it.
 
     :param rest: rl_zoo3's arguments, and ``--output``
+    :return: exit status, 2 if no run has episodes enough for a curve
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_dreamer_urlb.zoo plot", add_help=False)
     parser.add_argument("--output")
+    parser.add_argument("-w", "--episode-window", type=int, default=100)
     own, rest = parser.parse_known_args(rest)
+    rest = [*rest, "--episode-window", str(own.episode_window)]
     if own.output or not _has_display():
         os.environ["MPLBACKEND"] = "Agg"
     if not own.output and not _has_display() and not {"-h", "--help"} & set(rest):
@@ -97,8 +128,28 @@ def _plot(rest: list[str]) -> None:
     # Folders of runs have a dash where the id has a slash.
     sys.argv = [parser.prog, *(argument.replace("/", "-") if argument.startswith("urlb/") else argument for argument in rest)]
     if own.output:
-        plt.show = lambda *args, **kwargs: plt.savefig(own.output)
-    plot_train()
+        plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
+    counts: dict[str, int] = {}
+    module = sys.modules[plot_train.__module__]
+    load_results = module.load_results
+
+    def counting(folder: str) -> Any:
+        found = load_results(folder)
+        counts[folder] = len(found)
+        return found
+
+    with mock.patch.object(module, "load_results", counting):
+        plot_train()
+    few = {folder: count for folder, count in counts.items() if count < own.episode_window}
+    for folder, count in few.items():
+        print(
+            f"{parser.prog}: {folder} has {count} episodes, too few for a mean over {own.episode_window}: "
+            f"-w {max(count // 2, 1)} takes the mean over fewer",
+            file=sys.stderr,
+        )
+    if not counts:
+        print(f"{parser.prog}: no run with finished episodes was found", file=sys.stderr)
+    return 2 if len(few) == len(counts) else 0
 
 
 if __name__ == "__main__":

@@ -86,6 +86,7 @@ def push(argv: Sequence[str], prog: str) -> str:
                 video_length=0 if options.no_render else options.n_timesteps,
                 commit_message=options.commit_message,
                 private=options.private or None,
+                progress_bar=True,
                 extra_files=_zoo_files(run, saved, env_kwargs, Path(folder)),
             )
     finally:

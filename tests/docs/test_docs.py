@@ -227,3 +227,13 @@ def test_sharing(small_world, tmp_path):
     names = run(block, {})
     assert Path(names["path"]) == Path("shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
     assert names["model"].phase == "finetuning" and "python train.py" in (tmp_path / "shared/walker-run/README.md").read_text()
+
+
+def test_one_line_installs_everywhere():
+    """No index has the package: whoever wrote its name there would get somebody else's."""
+    texts = {path: path.read_text() for path in [*PAGES, *(ROOT / "sb3_dreamer_urlb").rglob("*.py")]}
+    lines = [
+        (path.name, found) for path, text in texts.items() for found in re.findall(r"pip install [^`\n)]*\[[^`\n)]*", text)
+    ]
+    ours = [(name, line) for name, line in lines if "gymnasium[" not in line]
+    assert len(ours) > 5 and all(re.match(r"pip install '\.\[[\w,{}]+\]'", line) for _, line in ours), ours

@@ -29,6 +29,7 @@ import sb3_dreamer_urlb
 from sb3_dreamer_urlb import DreamerV2, SnapshotError
 from sb3_dreamer_urlb.hub import load_from_hub, load_vec_normalize, package_to_hub, push_to_hub, save_vec_normalize
 from sb3_dreamer_urlb.hub import package as packaging
+from sb3_dreamer_urlb.hub.model_card import who_registers
 from sb3_dreamer_urlb.hub.repositories import FolderRepository, HubRepository, check_filename, open_repository
 
 ID, VECTORS = "test/Counter-v0", "test/Vectors-v0"
@@ -144,8 +145,9 @@ def test_the_code_in_the_card_runs(tiny_model, weights, tmp_path, monkeypatch, k
     else:
         model = tiny_model(VecNormalize(make_vec_env(VECTORS, 2)), "MlpPolicy").learn(40)
     package_to_hub(model, "./shared", n_eval_episodes=1, video_length=0)
-    monkeypatch.chdir(tmp_path / "..")
-    [code] = re.findall(r"```python\n(.*?)```", card(tmp_path / "shared").text, re.DOTALL)
+    monkeypatch.chdir((tmp_path / "shared").rename(tmp_path / "copied"))  # a colleague's copy
+    [code] = re.findall(r"```python\n(.*?)```", card(tmp_path / "copied").text, re.DOTALL)
+    assert str(tmp_path) not in card(tmp_path / "copied").text
     before = weights(model.policy)
     names: dict = {}
     exec(code.replace("model.learn(50_000)", "model.learn(8)"), names)
@@ -158,8 +160,10 @@ def test_the_code_in_the_card_runs(tiny_model, weights, tmp_path, monkeypatch, k
 
 def test_an_environment_of_ones_own(tiny_model, tmp_path):
     model = tiny_model(CounterEnv(8)).learn(8)
-    with pytest.raises(ValueError, match="no registered id: give env"):
-        package_to_hub(model, tmp_path, video_length=0)
+    with pytest.raises(
+        ValueError, match=r"needs eval_env, .*; and env_id, .*; and the extra file 'notes': there is no /none\."
+    ):
+        package_to_hub(model, tmp_path, video_length=0, extra_files={"notes": "/none"})
     with pytest.raises(ValueError, match="give env_id"):
         package_to_hub(model, tmp_path, CounterEnv(8), video_length=0)
     package_to_hub(model, tmp_path, CounterEnv(8), n_eval_episodes=1, env_id="my env", model_name="best", video_length=0)
@@ -190,11 +194,11 @@ def test_without_pictures_there_is_no_film(tiny_model, tmp_path):
 
 def test_missing_packages_are_told_at_once(model, tmp_path, monkeypatch):
     monkeypatch.setattr(packaging.importlib.util, "find_spec", lambda name: None if name == "imageio_ffmpeg" else name)
-    with pytest.raises(ImportError, match=r"pip install 'sb3_dreamer_urlb\[hub\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[hub\]'"):
         package_to_hub(model, tmp_path)
     package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match=r"pip install 'sb3_dreamer_urlb\[hub\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[hub\]'"):
         load_from_hub("user/name")
     assert load_from_hub(tmp_path).endswith(".zip")  # a folder needs nothing
 
@@ -445,3 +449,21 @@ def test_further_files(model, tmp_path):
     assert (folder / "logs" / "a.zip").read_bytes() == buffer.getvalue()
     with pytest.raises(ValueError, match="no name of a file"):
         package_to_hub(model, folder, n_eval_episodes=1, video_length=0, extra_files={"../a": tmp_path / "a"})
+
+
+def test_the_card_says_what_an_environment_needs_that_no_package_registers(tiny_model, tmp_path, capsys):
+    model = tiny_model(CounterEnv(8)).learn(8)
+    package_to_hub(model, tmp_path, CounterEnv(8), 2, env_id="my env", video_length=0, progress_bar=True)
+    text = card(tmp_path).text
+    assert "No package registers this environment" in text and 'gymnasium.make("my env")' not in text
+    assert "2/2" in capsys.readouterr().err
+
+
+def test_the_card_imports_who_registers_the_environment():
+    gymnasium.register("Fake/Own-v0", entry_point="fake_envs:CounterEnv")
+    try:
+        assert who_registers("Fake/Own-v0") == (["import fake_envs  # registers Fake/Own-v0"], True)
+    finally:
+        del gymnasium.registry["Fake/Own-v0"]
+    assert who_registers("urlb/walker-run-v0") == who_registers("Pendulum-v1") == ([], True)
+    assert who_registers("nowhere-v0") == ([], False)

@@ -242,7 +242,9 @@ def test_without_the_package(monkeypatch, tmp_path):
         builtins, "__import__", lambda name, *a: (_ for _ in ()).throw(ModuleNotFoundError("No module named 'lmdb'"))
         if name == "lmdb" else real(name, *a)
     )  # fmt: skip
-    with pytest.raises(ModuleNotFoundError, match=r"store='lmdb' needs a package: pip install 'sb3_dreamer_urlb\[lmdb\]'"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"store='lmdb' needs a package; in a clone of the repository: pip install '\.\[lmdb\]'"
+    ):
         on_disk(tmp_path)
 
 

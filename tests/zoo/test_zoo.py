@@ -266,7 +266,7 @@ def test_mistakes_are_named(zoo, monkeypatch):
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     assert main(["train"]) == 2
-    assert "pip install 'sb3_dreamer_urlb[zoo]'" in capsys.readouterr().err
+    assert "pip install '.[zoo]'" in capsys.readouterr().err
 
 
 def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
@@ -285,6 +285,36 @@ def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
     plt.close("all")
     with pytest.raises(SystemExit):
         zoo(*plot)
+
+
+def test_a_run_that_is_not_there_costs_a_line(zoo, capsys):
+    for command in ("enjoy", "record_video"):
+        with pytest.raises(SystemExit, match=r"^2$"):
+            zoo(command, "--algo", "dreamerv2", "--env", STAND, "-f", "logs")
+        [line] = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"python -m sb3_dreamer_urlb.zoo {command}: ") and "no run in logs/dreamerv2" in line
+    Path("logs/dreamerv2/urlb-walker-run-v0_3").mkdir(parents=True)
+    with pytest.raises(SystemExit):
+        zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "logs", "--exp-id", "7")
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.endswith("runs in logs/dreamerv2: urlb-walker-run-v0_3")
+
+
+def test_plot_says_when_episodes_are_too_few(zoo, capsys, monkeypatch):
+    folder = Path("logs/dreamerv2/urlb-walker-stand-v0_1")
+    folder.mkdir(parents=True)
+    rows = "".join(f"{i}.0,20,{i}\n" for i in range(6))
+    (folder / "0.monitor.csv").write_text(f'#{{"t_start": 0.0, "env_id": "x"}}\nr,l,t\n{rows}')
+    from matplotlib import pyplot as plt
+
+    monkeypatch.setattr(plt, "show", plt.show)
+    plot = ["plot", "-a", "dreamerv2", "-e", STAND, "-f", "logs", "--output", "curve.png"]
+    assert main(plot) == 2 and not Path("curve.png").exists()
+    error = capsys.readouterr().err
+    assert "has 6 episodes, too few for a mean over 100: -w 3 takes the mean over fewer" in error
+    assert main([*plot, "-w", "3"]) == 0 and Path("curve.png").exists()
+    assert capsys.readouterr().err == ""
+    plt.close("all")
 
 
 def test_optimize(zoo, monkeypatch):
