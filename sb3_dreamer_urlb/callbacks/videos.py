@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.evaluation import recording
-from sb3_dreamer_urlb.evaluation.figures import truth_model_error
+from sb3_dreamer_urlb.evaluation.films import labelled_open_loop
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures, predict_open_loop
 from sb3_dreamer_urlb.number_checks import check_integer
@@ -124,7 +124,8 @@ class VideoCallback(BaseCallback):
                 model.policy, played.observations, played.actions, self.open_loop_start, self.context, self.horizon
             )
         images = [image_of(kind, part) for part in (truth, predicted)]
-        panels = truth_model_error(*(pictures(image) for image in images if image is not None))
+        its_truth, its_model = (pictures(image) for image in images if image is not None)
+        panels = labelled_open_loop(its_truth, its_model, self.context, self.open_loop_start)
         self._put(OPEN_LOOP, list(panels), played.fps)
 
     def _env(self) -> VecEnv:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
 from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
+from sb3_dreamer_urlb.cli import pace
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation import figures
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.number_checks import check_positive
+
+#: frames of an episode, where the environment does not say
+EPISODE = 1000
+#: seconds that the demonstration may take before it takes smaller numbers by itself
+LIMIT = 25 * 60.0
+#: the smallest share of its frames that still shows something
+LEAST = 0.3
 
 
 @dataclass
@@ -80,6 +89,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     config.out.mkdir(parents=True, exist_ok=True)
 
     env = gymnasium.make(f"urlb/{config.task}-v0", fast_render=config.fast_render, render_mode="rgb_array")
+    config = fitted(config, env)
     model, recorder = _train(config, env)
     returns = evaluate(model, env, config.episodes)
     random_returns = evaluate(RandomPolicy(env.action_space, config.seed), env, config.episodes)
@@ -94,16 +104,59 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     return result
 
 
-def _train(config: DemoConfig, env: gymnasium.Env) -> tuple[DreamerV2, EpisodeRecorder]:
-    model = DreamerV2(
+def fitted(config: DemoConfig, env: gymnasium.Env, limit: float = LIMIT) -> DemoConfig:
+    """Say how long it will take on this machine; on a slow one take fewer frames and episodes, and say that, too.
+
+    :param config: numbers that are not the defaults are somebody's wish, and stay
+    :param env: like the one to train in
+    :param limit: seconds
+    :return: what to do
+    """
+    model = _model(config, env)
+    its_pace = pace.measure(model, env)
+    defaults = {field.name: field.default for field in dataclasses.fields(DemoConfig)}
+    names = [name for name in ("pretrain_frames", "finetune_frames") if getattr(config, name) == defaults[name]]
+
+    def at(share: float) -> DemoConfig:
+        episodes = 1 if share < 1 and config.episodes == defaults["episodes"] else config.episodes
+        frames = {name: round(share * getattr(config, name), -2) for name in names}
+        return dataclasses.replace(config, **frames, episodes=episodes)
+
+    def seconds(share: float) -> float:
+        its = at(share)
+        training = pace.phase(model, its.pretrain_frames, False) + pace.phase(model, its.finetune_frames, True)
+        episode = getattr(env.spec, "max_episode_steps", None) or EPISODE // model.action_repeat
+        # One more is filmed. The random policy costs the environment's steps only.
+        shown = pace.Amount((its.episodes + 1) * episode, 0, (its.episodes + 1) * episode)
+        return (training + shown).seconds(its_pace) + its.episodes * episode * its_pace.step
+
+    share = pace.shrink(seconds, limit, LEAST)
+    chosen = at(share)
+    print(f"An update takes {its_pace.update:.2f} s here, a planned action {its_pace.plan:.2f} s.")
+    if chosen != config:
+        print(
+            f"All of it would take {pace.in_words(seconds(1.0))}: on this machine {chosen.pretrain_frames} and "
+            f"{chosen.finetune_frames} frames in place of {config.pretrain_frames} and {config.finetune_frames}, evaluated in "
+            f"{chosen.episodes} episode(s) in place of {config.episodes}. Give the numbers yourself for the whole."
+        )
+    print(f"The demonstration will take {pace.in_words(seconds(share))}.", flush=True)
+    return chosen
+
+
+def _model(config: DemoConfig, env: gymnasium.Env, log: str | None = None) -> DreamerV2:
+    return DreamerV2(
         "CnnPolicy",
         env,
         intrinsic_reward="lbs",
         planner="dyna_mpc",
         preset=config.preset,
         seed=config.seed,
-        tensorboard_log=str(config.out / "tensorboard"),
+        tensorboard_log=log,
     )
+
+
+def _train(config: DemoConfig, env: gymnasium.Env) -> tuple[DreamerV2, EpisodeRecorder]:
+    model = _model(config, env, str(config.out / "tensorboard"))
     recorder = EpisodeRecorder()
     callbacks = [
         recorder,
@@ -128,7 +181,9 @@ def _draw(
     # Every second picture: half the size, same speed.
     figures.write_gif(episode.frames[:300:2], config.out / "agent.gif", fps / 2)
     truth, predicted = figures.open_loop(model.policy, episode, start=50, steps=45)
-    figures.write_gif(figures.truth_model_error(truth, predicted), config.out / "open_loop.gif", fps / 2, scale=3)
+    film = figures.labelled_open_loop(truth, predicted, figures.CONTEXT, start=50)
+    figures.write_gif(film, config.out / "open_loop.gif", fps / 2)
+    figures.open_loop_errors(model.policy, episode, 50, 45, config.out / "open_loop.png")
 
 
 def _print_table(

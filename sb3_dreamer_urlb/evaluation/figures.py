@@ -11,12 +11,24 @@ import numpy as np
 import torch as th
 
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
+from sb3_dreamer_urlb.evaluation.films import labelled_open_loop, truth_model_error
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
-from sb3_dreamer_urlb.evaluation.open_loop import pictures, predict_open_loop
+from sb3_dreamer_urlb.evaluation.open_loop import dream, pictures, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
 from sb3_dreamer_urlb.version import how_to_install
 
 MISSING_PLOTS = f"Pictures need matplotlib and pillow; {how_to_install('plots')}."
+__all__ = [
+    "CONTEXT",
+    "CurvePoint",
+    "check_plots_installed",
+    "labelled_open_loop",
+    "learning_curve",
+    "open_loop",
+    "open_loop_errors",
+    "truth_model_error",
+    "write_gif",
+]
 CONTEXT = 5  # observations the model sees before it predicts on its own
 
 
@@ -84,10 +96,46 @@ def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: 
     return pictures(truth), pictures(predicted)
 
 
-def truth_model_error(truth: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """Three pictures side by side: truth, model, and their difference around grey, uint8 (n, height, 3·width, C)."""
-    error = (truth.astype(np.int16) - model.astype(np.int16)) // 2 + 128
-    return np.concatenate([truth, model, error.astype(np.uint8)], 2)
+def open_loop_errors(
+    policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: int, path: str | os.PathLike[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw how a prediction grows worse with its horizon, and what it thought of the rewards.
+
+    :param policy: whose world model predicts; before it has learnt a task, its rewards say nothing
+    :param episode: what really happened
+    :param start: first observation that the model sees
+    :param steps: predicted steps
+    :param path: of the PNG
+    :return: root mean square error of each picture, in grey levels of 255, and the predicted rewards, float (CONTEXT + steps,)
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    seen = th.as_tensor(episode.observations).permute(0, 3, 1, 2)
+    truth, features = dream(policy, seen, episode.actions, start, CONTEXT, steps)
+    with th.no_grad():
+        model = policy.agent.world_model
+        difference = (pictures(model.decoder(features)).astype(float) - pictures(truth)) ** 2
+        rewards = model.reward(features).cpu().numpy().reshape(-1)
+    errors = np.sqrt(difference.mean((1, 2, 3)))
+    shown = np.arange(len(errors)) - CONTEXT + 1
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
+    left.plot(shown, errors, color="tab:blue")
+    left.set(xlabel="steps predicted", ylabel="error of the picture (of 255)", ylim=(0, None))
+    right.plot(shown, rewards, color="tab:blue", label="predicted")
+    if len(episode.rewards):
+        # Reward t − 1 came with observation t.
+        true = np.concatenate([[0.0], episode.rewards])[start : start + len(errors)]
+        right.plot(shown, true, color="black", linewidth=1, label="true")
+    right.set(xlabel="steps predicted", ylabel="reward")
+    right.legend(fontsize=8)
+    for axes in (left, right):
+        axes.axvline(0.5, color="grey", linewidth=0.8, linestyle=":")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return errors, rewards
 
 
 def write_gif(frames: Sequence[np.ndarray] | np.ndarray, path: str | os.PathLike[str], fps: float, scale: int = 1) -> None:

@@ -14,7 +14,16 @@ from sb3_dreamer_urlb.types import LatentState, Observation, batch_size, map_obs
 def predict_open_loop(
     policy: DreamerPolicy, seen: Observation, actions: np.ndarray, start: int, context: int, steps: int
 ) -> tuple[Observation, Observation]:
-    """Truth and prediction of a part of one episode. Draws from torch's global generator.
+    """Truth and prediction of a part of one episode, see :func:`dream`: both preprocessed, float (context + steps, …)."""
+    truth, features = dream(policy, seen, actions, start, context, steps)
+    return truth, policy.agent.world_model.decoder(features)
+
+
+@th.no_grad()
+def dream(
+    policy: DreamerPolicy, seen: Observation, actions: np.ndarray, start: int, context: int, steps: int
+) -> tuple[Observation, th.Tensor]:
+    """A part of one episode, and the model's features of it. Draws from torch's global generator.
 
     :param policy: whose world model predicts
     :param seen: the episode's observations as the policy takes them (images channels first), (n, …)
@@ -22,7 +31,7 @@ def predict_open_loop(
     :param start: first observation that the model sees
     :param context: observations that it sees
     :param steps: observations that it predicts after them, fewer where the episode ends
-    :return: both preprocessed, float (context + steps, …)
+    :return: the truth, preprocessed, float (context + steps, …), and the features, float (context + steps, F)
     :raises ValueError: if the episode has no observation after the context
     """
     model, device = policy.agent.world_model, policy.device
@@ -43,7 +52,7 @@ def predict_open_loop(
     for t in range(context, end - start):
         state = model.rssm.prior_step(state, action[None, t])
         features.append(state.feature[0])
-    return truth, model.decoder(th.stack(features))
+    return truth, th.stack(features)
 
 
 def has_image(observations: Observations) -> bool:

@@ -40,12 +40,14 @@ class PlayedEpisode:
     :param actions: as the environment received them, float (steps, A)
     :param total_reward: undiscounted return
     :param frames: large pictures, uint8, empty unless asked for
+    :param rewards: of each step, float (steps,)
     """
 
     observations: np.ndarray
     actions: np.ndarray
     total_reward: float
     frames: list[np.ndarray] = field(default_factory=list)
+    rewards: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
 def play_episode(
@@ -60,21 +62,21 @@ def play_episode(
     :param render: also keep ``env.render()`` after each step
     """
     observation, _ = env.reset(seed=seed)
-    observations, actions, frames = [observation], [], []
+    observations, actions, frames, rewards = [observation], [], [], []
     state: Any = None
-    total, done = 0.0, False
+    done = False
     start = np.ones(1, bool)
     while not done:
         action, state = model.predict(observation, state, start, deterministic)
         start = np.zeros(1, bool)
         observation, reward, terminated, truncated, _ = env.step(action)
         done = terminated or truncated
-        total += float(reward)
+        rewards.append(float(reward))
         observations.append(observation)
         actions.append(action)
         if render:
             frames.append(np.asarray(env.render()))
-    return PlayedEpisode(np.stack(observations), np.stack(actions), total, frames)
+    return PlayedEpisode(np.stack(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
 
 
 def evaluate(model: PolicyPredictor, env: gymnasium.Env, episodes: int, seed: int = 1000) -> list[float]:

@@ -20,6 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_dreamer_urlb import PhaseSwitchCallback, VideoCallback
 from sb3_dreamer_urlb.evaluation import recording
+from sb3_dreamer_urlb.evaluation.films import LINE
 from sb3_dreamer_urlb.evaluation.open_loop import image_of, pictures, predict_open_loop
 
 ID, OTHER = "test/Counter-v0", "test/OtherCounter-v0"
@@ -62,7 +63,7 @@ def test_films_in_tensorboard_at_the_chosen_interval(tiny_model, tmp_path):
     # The whole episode, as the environment draws it; then truth, model and error side by side.
     agent, open_loop = found["video/agent"][0][1], found["video/open_loop"][0][1]
     assert agent.shape == (12, 32, 32, 3) and [int(frame[5, 5, 0]) for frame in agent[:3]] == [0, 3, 6]
-    assert open_loop.shape == (9, 16, 48, 3)
+    assert open_loop.shape == (9, 12 * 16 + 2 * LINE, 12 * 48, 3)  # enlarged and labelled
 
 
 def test_the_open_loop_film_shows_truth_model_and_error(tiny_model, tmp_path):
@@ -72,7 +73,7 @@ def test_the_open_loop_film_shows_truth_model_and_error(tiny_model, tmp_path):
             parameter.zero_()
     model.learn(8, VideoCallback(video_freq=8, context=3, horizon=6))
     [(_, frames)] = films(tmp_path)["video/open_loop"]
-    truth, predicted, error = np.split(frames.astype(int), 3, 2)
+    truth, predicted, error = np.split(frames[:, LINE:-LINE][:, ::12, ::12].astype(int), 3, 2)
     assert (predicted == 128).all()
     counted = 7 * np.arange(1, 10) % 256  # picture 0 was the reset before the run, to see whether there are pictures
     assert np.abs(truth[:, 5, 5, 0] - counted).max() <= 4  # a palette has 256 colours
@@ -138,7 +139,12 @@ def test_of_dicts_the_image_is_shown(tiny_model, tmp_path):
     model.learn(8, VideoCallback(env, video_freq=8, context=2, horizon=3))
     found = films(tmp_path)
     # Without a render mode the agent's own view is the film; one channel is shown as grey.
-    assert found["video/agent"][0][1].shape == (8, 16, 20, 3) and found["video/open_loop"][0][1].shape == (5, 16, 60, 3)
+    assert found["video/agent"][0][1].shape == (8, 16, 20, 3) and found["video/open_loop"][0][1].shape == (
+        5,
+        160 + 2 * LINE,
+        600,
+        3,
+    )
 
 
 def test_terminal_observations_belong_to_the_episode(tiny_model):

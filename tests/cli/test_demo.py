@@ -16,7 +16,7 @@ from PIL import Image
 from sb3_dreamer_urlb import DreamerV2, __main__, __version__
 from sb3_dreamer_urlb.cli import demo
 from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
-from sb3_dreamer_urlb.evaluation import figures
+from sb3_dreamer_urlb.evaluation import figures, films
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score
 
@@ -44,13 +44,14 @@ def check_output(out, pretrain_frames, size):
         "tensorboard",
         "learning_curve.png",
         "open_loop.gif",
+        "open_loop.png",
         "agent.gif",
     }
     assert list(out.glob("tensorboard/*/events*"))
     with Image.open(out / "learning_curve.png") as picture:
         assert picture.width > 400 and len(picture.convert("L").getcolors(256) or []) > 5
     with Image.open(out / "open_loop.gif") as picture:
-        assert picture.size == (3 * 3 * size, 3 * size) and picture.n_frames > 10
+        assert picture.size == (3 * 192, 192 + 2 * films.LINE) and picture.n_frames > 10
     with Image.open(out / "agent.gif") as picture:
         assert picture.n_frames > 10
     before = DreamerV2.load(out / f"pretrained_{pretrain_frames}.zip", device="cpu")
@@ -206,6 +207,34 @@ def test_three_panels():
     panels = figures.truth_model_error(truth, model)
     assert panels.shape == (2, 4, 15, 3) and panels.dtype == np.uint8
     assert panels[0, 0, [0, 5, 10], 0].tolist() == [200, 100, 178]
+
+
+def test_a_labelled_film():
+    truth, model = (np.full((7, 16, 24, 3), level, np.uint8) for level in (200, 100))
+    film = figures.labelled_open_loop(truth, model, context=2, start=30)
+    assert film.shape == (7, 16 * 8 + 2 * films.LINE, 3 * 192, 3) and film.dtype == np.uint8
+    panels = film[:, films.LINE : -films.LINE]
+    assert np.array_equal(panels[:, ::8, ::8], figures.truth_model_error(truth, model))
+    above, below = film[:, : films.LINE], film[:, -films.LINE :]
+    assert all(above[0, :, i * 192 : (i + 1) * 192].any() for i in range(3)) and (above == above[0]).all()
+    assert len({line.tobytes() for line in below}) == 7  # each its step
+
+
+def test_errors_over_the_horizon(tiny_model, tmp_path):
+    env = CounterEnv(40)
+    model = tiny_model(env)
+    episode = play_episode(model, env)
+    assert episode.rewards.tolist() == [(0.0, 1.0, 0.5)[i % 3] for i in range(40)] and episode.total_reward == sum(
+        episode.rewards
+    )
+    th.manual_seed(0)
+    errors, rewards = figures.open_loop_errors(model.policy, episode, 10, 20, tmp_path / "errors.png")
+    th.manual_seed(0)
+    truth, predicted = figures.open_loop(model.policy, episode, 10, 20)
+    assert errors == pytest.approx(np.sqrt(((truth.astype(float) - predicted) ** 2).mean((1, 2, 3))))
+    assert rewards.shape == (25,) and np.isfinite(rewards).all()
+    with Image.open(tmp_path / "errors.png") as picture:
+        assert picture.width > 800 and len(picture.convert("L").getcolors(256) or []) > 5
 
 
 def test_scores():
