@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,17 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
 from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
 from sb3_dreamer_urlb.cli import pace
+from sb3_dreamer_urlb.cli.report import write_report
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.evaluation import figures
+from sb3_dreamer_urlb.evaluation.agent_rows import row_of
+from sb3_dreamer_urlb.evaluation.append import append_row
+from sb3_dreamer_urlb.evaluation.episodes import SEED, Evaluation
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.number_checks import check_positive
@@ -99,6 +105,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
         "oracle": oracle(config.task),
     }
     _draw(config, model, env, recorder, result)
+    _report(config, model, env, returns)
     env.close()
     _print_table(config, result, returns, random_returns, time.time() - began)
     return result
@@ -184,6 +191,18 @@ def _draw(
     film = figures.labelled_open_loop(truth, predicted, figures.CONTEXT, start=50)
     figures.write_gif(film, config.out / "open_loop.gif", fps / 2)
     figures.open_loop_errors(model.policy, episode, 50, 45, config.out / "open_loop.png")
+
+
+def _report(config: DemoConfig, model: DreamerV2, env: gymnasium.Env, returns: list[float]) -> None:
+    """The page that the demonstration ends with; a row of its evaluation stands beside the paper's numbers."""
+    domain, task = config.task.split("-")
+    planner = str(model.planner) if model._planner_is_on() else "none"
+    played = Evaluation(returns, [], planner, math.nan, SEED)
+    rows = config.out / "rows.csv"
+    # Of a demonstration before this one.
+    rows.unlink(missing_ok=True)
+    append_row(rows, row_of(model, DummyVecEnv([lambda: env]), played, config.keep_actor, domain=domain, task=task))
+    write_report(config.out, command=f"sb3-dreamer-urlb demo --task {config.task} --seed {config.seed}")
 
 
 def _print_table(

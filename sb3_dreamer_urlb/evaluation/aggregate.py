@@ -158,7 +158,7 @@ def iqm(scores: Scores, repetitions: int = REPETITIONS, size: float = SIZE, seed
 
 
 def performance_profile(
-    scores: Scores, thresholds: Sequence[float], repetitions: int = REPETITIONS, size: float = SIZE, seed: int = 0
+    scores: Scores, thresholds: Sequence[float] | np.ndarray, repetitions: int = REPETITIONS, size: float = SIZE, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Share of runs whose score is above each threshold, tasks counting alike.
 
@@ -195,15 +195,14 @@ def probability_of_improvement(
     :raises ImportError: if rliable is not installed
     """
     check_rliable_installed()
-    from rliable import metrics
-
     common = [task for task in scores if len(scores[task]) and len(other.get(task, ()))]
     if not common:
         return NOTHING
 
     def statistic(*tasks: np.ndarray) -> float:
         pairs = zip(tasks[: len(common)], tasks[len(common) :], strict=True)
-        return float(np.mean([metrics.probability_of_improvement(x[:, None], y[:, None]) for x, y in pairs]))
+        # What rliable computes by a rank test, a hundred times slower: the share of pairs, ties count half.
+        return float(np.mean([np.mean((np.sign(x[:, None] - y) + 1) / 2) for x, y in pairs]))
 
     both = {f"{i}-{task}": side[task] for i, side in enumerate((scores, other)) for task in common}
     found = _with_interval(both, statistic, repetitions, size, seed)

@@ -13,6 +13,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from sb3_dreamer_urlb.evaluation.names import UnknownName, method_name, task_nam
 
 #: columns that say how an evaluation came about or what it cost; two rows that differ only here are about the same run
 DESCRIBING = frozenset(
-    ("algorithm_version", "commit", "device", "evaluation_seed", "machine", "note", "returns", "run_folder")
-    + ("snapshot", "source", "versions", "written")
+    ("algorithm_version", "commit", "device", "evaluation_seed", "intrinsic_reward", "ldd", "machine", "note", "returns")
+    + ("run_folder", "snapshot", "source", "versions", "written")
 )
 #: what was measured; ``seconds`` may differ between two evaluations that agree
 RESULT = ("return_mean", "return_std", "episodes")
@@ -77,7 +78,7 @@ class Row:
         """Value of any column; ``""`` for a further one that the row does not have."""
         return getattr(self, column) if column in REQUIRED else self.further.get(column, "")
 
-    @property
+    @cached_property
     def key(self) -> tuple[tuple[str, str], ...]:
         """What tells runs apart: every column but what was measured and how it came about."""
         measured = {*RESULT, "seconds", *DESCRIBING}

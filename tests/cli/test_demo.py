@@ -46,6 +46,9 @@ def check_output(out, pretrain_frames, size):
         "open_loop.gif",
         "open_loop.png",
         "agent.gif",
+        "rows.csv",
+        ".rows.csv.lock",
+        "report.html",
     }
     assert list(out.glob("tensorboard/*/events*"))
     with Image.open(out / "learning_curve.png") as picture:

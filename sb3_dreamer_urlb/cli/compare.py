@@ -1,0 +1,55 @@
+"""Lay runs, or groups of seeds, side by side: one page with curves and intervals, and its picture.
+
+A group is a folder of a run, or LABEL=FOLDER,FOLDER,... for several seeds of one setting.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.evaluation.run_facts import RunFacts
+
+HELP = "lay runs or groups of seeds side by side, with intervals"
+TAGS = ("eval/mean_reward", "rollout/ep_rew_mean")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="folder, or LABEL=FOLDER,FOLDER,... for seeds of one setting")
+    parser.add_argument("--out", type=Path, required=True, help="page, compare.html say; its picture comes beside it")
+    parser.add_argument("--tag", help="of the log (default: the first of eval/mean_reward, rollout/ep_rew_mean that all have)")
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for groups that share no log
+    :raises FileNotFoundError: if there is no run in a folder
+    """
+    from sb3_dreamer_urlb.evaluation.comparison import compare
+    from sb3_dreamer_urlb.evaluation.run_facts import read_run
+    from sb3_dreamer_urlb.evaluation.run_page import compare_page, embedded_png
+    from sb3_dreamer_urlb.snapshots.atomic import written_atomically
+
+    groups: dict[str, list[RunFacts]] = {}
+    for text in options["runs"]:
+        label, equals, folders = text.rpartition("=")
+        paths = [Path(folder) for folder in folders.split(",")]
+        label = label if equals else paths[0].resolve().name
+        groups.setdefault(label, []).extend(read_run(path) for path in paths)
+    picture, table, settings = compare(groups, options.get("tag"), TAGS)
+    out: Path = options["out"]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    picture.name = out.stem
+    paths = picture.write(out.parent)
+    page = compare_page(" against ".join(groups), embedded_png(paths[1]), picture.caption, settings, table)
+    with written_atomically(out) as file:
+        file.write(page.encode())
+    print(f"{table.text()}\nWrote {out}, {', '.join(map(str, paths))}.")
+    return 0

@@ -1,0 +1,127 @@
+"""Turn rows of evaluations into the paper's tables and figures.
+
+Tables go to the terminal and into the folder as Markdown, CSV and LaTeX, figures into it as PDF and PNG. What has no rows is
+left out and named; what has some is drawn with labelled gaps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.evaluation.arms import Study
+    from sb3_dreamer_urlb.evaluation.rows import Row
+    from sb3_dreamer_urlb.evaluation.style import Picture
+    from sb3_dreamer_urlb.evaluation.tables import Table
+
+HELP = "turn rows of evaluations into the paper's tables and figures"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("rows", type=Path, nargs="+", metavar="ROWS.csv", help="what evaluate and EvaluationCallback wrote")
+    parser.add_argument("--out", type=Path, required=True, help="folder, made if it is not there")
+    parser.add_argument("--finetune-frames", help="budget of fine-tuning, such as 100k (default: 100k, or what was reached)")
+    parser.add_argument("--pretrain-frames", help="length of the pre-training (default: 2M, or the longest there is)")
+    choices = ("dreamer_2m", "urlb_expert")
+    parser.add_argument(
+        "--normalizer", choices=choices, default=choices[0], help="what scores are shares of (default: %(default)s)"
+    )
+    parser.add_argument("--where", nargs="+", metavar="COLUMN=VALUE", help="use only rows with these values")
+    parser.add_argument(
+        "--curves", action="append", nargs="+", metavar="ARM", help="learning curves of arms such as method=lbs,planner=none"
+    )
+    parser.add_argument("--also-method", nargs="+", default=[], help="methods from outside the package")
+    parser.add_argument("--also-task", nargs="+", default=[], help="tasks from outside the benchmark, <domain>-<task>")
+    parser.add_argument("--repetitions", type=int, default=2000, help="of the bootstrap (default: %(default)s)")
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for rows about unknown things, or none
+    :raises ImportError: if the extra ``plots`` is not installed
+    """
+    from sb3_dreamer_urlb.evaluation.aggregate import check_rliable_installed
+    from sb3_dreamer_urlb.evaluation.arms import Study
+    from sb3_dreamer_urlb.evaluation.curves import selected
+    from sb3_dreamer_urlb.evaluation.rows import frames, read_rows
+    from sb3_dreamer_urlb.evaluation.style import check_matplotlib_installed
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_matplotlib_installed()
+    check_rliable_installed()
+    check_integer("--repetitions", options["repetitions"], 1)
+    read = read_rows(*options["rows"], methods=options["also_method"], tasks=options["also_task"])
+    if read.report():
+        print(read.report(), file=sys.stderr)
+    rows: list[Row] = read.rows
+    if "where" in options:
+        rows = list(selected(rows, " ".join(options["where"])).rows)
+    if not rows:
+        raise ValueError(f"{', '.join(map(str, options['rows']))}: no rows.")
+    budgets = {
+        name: frames(f"--{name}-frames", options[f"{name}_frames"])
+        for name in ("finetune", "pretrain")
+        if f"{name}_frames" in options
+    }
+    study = Study(rows, **budgets, normalizer=options["normalizer"])
+    for warning in study.mixtures():
+        print(f"These are averaged: {warning}", file=sys.stderr)
+    if study.unfinished:
+        print(f"{len(study.unfinished)} runs ended before {study.finetune} frames and are left out:", file=sys.stderr)
+        for row in study.unfinished:
+            print(f"  {row}", file=sys.stderr)
+    options["out"].mkdir(parents=True, exist_ok=True)
+    tables, pictures, missing = _made(study, options)
+    _write(tables, pictures, missing, options["out"])
+    return 0
+
+
+def _made(study: Study, options: dict[str, Any]) -> tuple[list[Table], list[Picture], list[str]]:
+    from sb3_dreamer_urlb.evaluation import paper_tables
+    from sb3_dreamer_urlb.evaluation.curves import learning_curves, selected
+    from sb3_dreamer_urlb.evaluation.paper_figures import FIGURES, profiles
+
+    repetitions = options["repetitions"]
+    tables = [paper_tables.summary(study, repetitions), paper_tables.raw_scores(study)]
+    missing = []
+    if len(study.approaches()) > 1:
+        tables.append(paper_tables.improvement(study, repetitions))
+    correlation = paper_tables.reward_correlation(study)
+    if correlation is None:
+        missing.append("correlation")
+    else:
+        tables.append(correlation)
+    pictures = []
+    for draw in FIGURES:
+        picture = profiles(study, repetitions) if draw is profiles else draw(study)
+        if picture is None:
+            missing.append(draw.__name__)
+        else:
+            pictures.append(picture)
+    for i, texts in enumerate(options.get("curves", ())):
+        arms = [selected(study.rows, text) for text in texts]
+        name = "learning_curves" + (f"_{i + 1}" if i else "")
+        pictures.append(learning_curves(arms, study.normalizer, study.synthetic, name))
+    return tables, pictures, missing
+
+
+def _write(tables: list[Table], pictures: list[Picture], missing: list[str], out: Path) -> None:
+    for table in tables:
+        table.write(out)
+        print(f"{table.text()}\n")
+    captions = []
+    for picture in pictures:
+        picture.write(out)
+        captions.append(f"**{picture.name}**: {picture.caption}\n")
+    (out / "captions.md").write_text("\n".join(captions), encoding="utf-8")
+    print(f"In {out}: {', '.join([*(table.name for table in tables), *(picture.name for picture in pictures)])}.")
+    if missing:
+        print(f"No rows for: {', '.join(missing)}.")

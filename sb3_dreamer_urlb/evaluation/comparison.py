@@ -1,0 +1,86 @@
+"""Runs, or groups of seeds, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sb3_dreamer_urlb.evaluation.aggregate import Estimate, standard_error
+from sb3_dreamer_urlb.evaluation.run_facts import RunFacts
+from sb3_dreamer_urlb.evaluation.style import COLUMN, Picture, finish, frames_label, lines, new_figure
+from sb3_dreamer_urlb.evaluation.tables import Table, with_error
+
+POINTS = 100
+
+
+def compare(
+    groups: Mapping[str, Sequence[RunFacts]], tag: str | None, tags: Sequence[str]
+) -> tuple[Picture, Table, list[dict[str, str]]]:
+    """Curves, last values and settings of groups of runs.
+
+    :param groups: label → its runs
+    :param tag: of the log; None takes the first of ``tags`` that all runs have
+    :param tags: to choose from
+    :return: picture, table, and for each group its label, runs and the settings that not all groups share
+    :raises ValueError: if no such log is there in all runs
+    """
+    runs = [(label, run) for label, members in groups.items() for run in members]
+    wanted = [tag] if tag else list(tags)
+    shared = [name for name in wanted if all(run.series.get(name) for _, run in runs)]
+    if not shared:
+        lacking = [str(run.folder) for _, run in runs if not any(run.series.get(name) for name in wanted)]
+        raise ValueError(f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}.")
+    name = shared[0]
+    figure, [axes] = new_figure(1, COLUMN * 1.4, 2.3)
+    table = Table(
+        "comparison",
+        f"{name} at the end of the shorter runs, mean ± standard error of the seeds.",
+        ["", name, "frames", "seeds"],
+    )
+    handles = []
+    for i, (label, members) in enumerate(groups.items()):
+        points = _mean_curve(members, name)
+        handles += lines(axes, {label: points}, {at: float(at) for at in points}, 1, band=True, first=i)
+        for run in members:
+            if run.switch is not None:
+                axes.axvline(run.switch * run.action_repeat, color="#999999", ls=":", lw=0.8, zorder=1)
+        last = max(points)
+        table.lines.append([label, with_error(points[last], digits=1), frames_label(last), str(len(members))])
+    axes.set(xlabel="environment frames", ylabel=name)
+    axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
+    counts = ", ".join(f"{label}: {len(members)}" for label, members in groups.items())
+    caption = (
+        f"{name} over environment frames; bands: mean ± standard error of the seeds ({counts}); dotted: fine-tuning begins."
+    )
+    return finish("comparison", figure, caption, False, handles, 2), table, _settings(groups)
+
+
+def _mean_curve(members: Sequence[RunFacts], name: str) -> dict[int, Estimate]:
+    """Over the frames that all runs of a group have come to."""
+    curves = [np.array(run.series[name], float) * (run.action_repeat, 1) for run in members]
+    begin, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
+    if begin > end:
+        raise ValueError(f"{', '.join(str(run.folder) for run in members)} have no frames in common.")
+    at = np.unique(np.linspace(begin, end, POINTS).round())
+    values = np.stack([np.interp(at, curve[:, 0], curve[:, 1]) for curve in curves])
+    found = {}
+    for frames, column in zip(at, values.T, strict=True):
+        error = standard_error(list(column))
+        mean = float(column.mean())
+        found[int(frames)] = Estimate(mean, mean - error, mean + error, 1, (len(members), len(members)))
+    return found
+
+
+def _settings(groups: Mapping[str, Sequence[RunFacts]]) -> list[dict[str, str]]:
+    names = sorted(
+        {name for members in groups.values() for run in members for name in run.arguments} - {"seed", "tensorboard_log"}
+    )
+    values = {name: {repr(run.arguments.get(name)) for members in groups.values() for run in members} for name in names}
+    differ = [name for name in names if len(values[name]) > 1]
+    rows = []
+    for label, members in groups.items():
+        own = {name: sorted({repr(run.arguments.get(name)) for run in members}) for name in differ}
+        settings = "; ".join(f"{name}={' / '.join(shown)}" for name, shown in own.items()) or "the same settings"
+        rows.append({"label": label, "runs": ", ".join(str(run.folder) for run in members), "settings": settings})
+    return rows

@@ -1,0 +1,167 @@
+"""The page of a run and the comparison of runs: parsed always, opened in headless Chromium where it is installed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_envs import CounterEnv
+from stable_baselines3.common.logger import configure
+
+from sb3_dreamer_urlb import EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
+from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.evaluation.gifs import encode_gif
+from sb3_dreamer_urlb.evaluation.run_facts import read_run, thinned
+
+SECTIONS = ("summary", "warnings", "evaluation", "films", "curves", "repeat", "configuration", "environment", "versions")
+WALKER = {"domain": "walker", "task": "run", "action_repeat": 2}
+
+
+class Page(HTMLParser):
+    """What a test asks of a page."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.ids += [values["id"]] if tag == "section" and values.get("id") else []
+        self.addresses += [
+            values[name] or "" for name in ("src", "href") if name in values and tag in ("img", "link", "script", "a")
+        ]
+        if tag in ("section", "table", "figure", "svg", "div", "body"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("section", "table", "figure", "svg", "div", "body"):
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a real, tiny run with both phases, logs, rows and films."""
+    from sb3_dreamer_urlb import DreamerV2
+
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    model = DreamerV2("CnnPolicy", CounterEnv(20, **WALKER), preset="tiny", seed=0, device="cpu", intrinsic_reward="lbs")
+    model.set_logger(configure(str(folder), ["csv"]))
+    evaluation = EvaluationCallback(CounterEnv(20, **WALKER), 40, 1, folder / "rows.csv")
+    callbacks = [PhaseSwitchCallback(120), RunCheckpointCallback(folder), evaluation]
+    model.learn(160, callback=callbacks, log_interval=1)
+    frames = np.random.default_rng(0).integers(0, 256, (3, 8, 24, 3), np.uint8)
+    for name in ("agent.gif", "open_loop_7.gif"):
+        (folder / name).write_bytes(encode_gif(frames, 10))
+    return folder
+
+
+def test_the_page_has_all_its_parts_and_needs_no_network(run: Path) -> None:
+    assert main(["report", str(run), "--command", "make <demo>"]) == 0
+    text = (run / "report.html").read_text()
+    page = Page(text)
+    assert page.ids == list(SECTIONS) and not page.open
+    assert len(page.addresses) == 2 and all(address.startswith("data:image/gif;base64,") for address in page.addresses)
+    assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
+    assert 'name="viewport"' in text and "viewBox" in text
+    for part in (
+        "lbs",
+        "walker-run",
+        "make <demo>",
+        "fine-tuning",
+        "train/kl",
+        "rollout/ep_rew_mean",
+        "batch_length",
+        "724",
+        "596",
+    ):
+        assert part in page.text, part
+    assert "None: no update was skipped" in page.text
+
+
+def test_the_switch_of_phases_is_known(run: Path) -> None:
+    facts = read_run(run)
+    assert facts.switch == facts.counters["pretrained_frames"] / 2 and 60 <= facts.switch <= 80
+    facts.data = {}
+    assert facts.switch is not None
+
+
+def test_warnings_stand_on_the_page(run: Path, tmp_path: Path) -> None:
+    facts = read_run(run)
+    facts.data["counters"] = {**facts.counters, "skipped_updates": 3, "env_faults": 2}
+    facts.series["train/kl"] = [(0, 1.0), (1, float("nan"))]
+    assert [line.split(":")[0].split(" ")[0] for line in facts.warnings()] == ["3", "2", "Logged"]
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (copy / "snapshot.zip").write_bytes(b"broken")
+    (copy / "rows.csv").write_text((copy / "rows.csv").read_text() + "lbs,wal\n")
+    assert main(["report", str(copy)]) == 0
+    text = Page((copy / "report.html").read_text()).text
+    assert "snapshot.zip" in text and "1 rows skipped" in text
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="the same page is parsed above; this opens it, too")
+def test_chromium_opens_the_page(run: Path, tmp_path: Path) -> None:
+    main(["report", str(run)])
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
+    flags += ["--disable-component-update", "--disable-sync", f"--user-data-dir={tmp_path / 'profile'}"]
+    address = (run / "report.html").resolve().as_uri()
+    seen = subprocess.run(
+        ["chromium", *flags, "--dump-dom", address], capture_output=True, text=True, timeout=200, check=True,
+        env={**os.environ, "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert all(f'id="{name}"' in seen.stdout for name in SECTIONS)
+    picture = tmp_path / "page.png"
+    subprocess.run(
+        ["chromium", *flags, "--window-size=390,844", f"--screenshot={picture}", address], capture_output=True, timeout=200,
+        check=True, env={**os.environ, "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert picture.stat().st_size > 10_000
+
+
+def test_runs_side_by_side(run: Path, tmp_path: Path, capsys: Any) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    out = tmp_path / "compare.html"
+    assert main(["compare", f"two seeds={run},{other}", str(run), "--out", str(out)]) == 0
+    page = Page(out.read_text())
+    assert page.ids == ["curves", "returns", "groups"] and page.addresses[0].startswith("data:image/png;base64,")
+    assert "two seeds" in page.text and "the same settings" in page.text
+    assert (tmp_path / "compare.pdf").stat().st_size > 3000
+    assert "two seeds" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["report", "nowhere"], "nowhere is no folder of a run"),
+        (["report", "."], "holds neither a snapshot nor logs"),
+        (["compare", "nowhere", "--out", "page.html"], "nowhere is no folder of a run"),
+    ],
+)
+def test_bad_input(command: list[str], message: str, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(command) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_runs_that_share_no_log(run: Path, tmp_path: Path, capsys: Any) -> None:
+    assert main(["compare", str(run), "--tag", "train/none", "--out", str(tmp_path / "page.html")]) == 2
+    assert "Not all runs have a log of train/none" in capsys.readouterr().err
+
+
+def test_long_lines_are_thinned() -> None:
+    points = [(float(i), float(i)) for i in range(5000)]
+    assert len(thinned(points)) == 400 and thinned(points)[0] == points[0] and thinned(points)[-1] == points[-1]
