@@ -59,7 +59,7 @@ class DemoConfig:
     preset: str = "small"
     fast_render: bool = True
     # The paper keeps the actor for walker. After three thousand frames it has learnt little but to act narrowly: fine-tuning
-    # starts better with a fresh one (docs/results.md).
+    # starts better with a fresh one (docs/notes/results.md).
     keep_actor: bool | None = False
 
     def __post_init__(self) -> None:

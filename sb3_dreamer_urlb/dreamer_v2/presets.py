@@ -15,9 +15,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Paper appendix "Hyperparameters" and docs/algorithm.md: the constructor's own defaults.
     "paper": {},
     # Learns on two CPU cores, in thousands of updates instead of tens of thousands. Found by trial on walker stand, see
-    # docs/results.md: a faster actor saturates before the model is any good, and without the larger entropy bonus it also
-    # stops exploring; the slow critic must keep up; so few samples need more of the actor's trajectories among them, and
-    # until the model is good, acting with them only adds noise to the data.
+    # docs/notes/results.md: a faster actor saturates before the model is any good, and without the larger entropy bonus it
+    # also stops exploring; the slow critic must keep up; so few samples need more of the actor's trajectories among them,
+    # and until the model is good, acting with them only adds noise to the data.
     "small": {
         "learning_rate": 1e-3,
         "actor_learning_rate": 1e-4,
@@ -42,9 +42,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
     },
     # Small tasks seen as vectors through VecNormalize (observations and rewards), on one CPU core: zoo_configs/vectors.yml.
-    # Found by trial, see docs/results.md. Few numbers say little in nats, so at the KL's full price the model stays blurred.
-    # Sequences run on from one episode into the next, which lets them be longer than the shortest: with ten rows a sequence,
-    # the model was lost after ten steps of acting. Many small categoricals average their noise away.
+    # Found by trial, see docs/notes/results.md. Few numbers say little in nats, so at the KL's full price the model stays
+    # blurred. Sequences run on from one episode into the next, which lets them be longer than the shortest: with ten rows a
+    # sequence, the model was lost after ten steps of acting. Many small categoricals average their noise away.
     "vector": {
         "learning_rate": 1e-3,
         "actor_learning_rate": 3e-4,

@@ -1,7 +1,7 @@
 """Keep the memory of big tensors on CPU, in place of giving it back to the kernel after every use.
 
 An update at paper size makes and drops several GB of tensors. By default glibc maps each block of more than 32 MB afresh
-and unmaps it when it is freed, so every update pays for the same page faults again (docs/performance.md).
+and unmaps it when it is freed, so every update pays for the same page faults again (docs/notes/performance.md).
 """
 
 from __future__ import annotations

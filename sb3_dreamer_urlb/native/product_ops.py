@@ -1,7 +1,7 @@
 """Products on a processor's tiles (AMX) as torch operators: rows · weights with what follows, and the gradient of weights.
 
 Operands are bfloat16, or float32 as three bfloat16 parts each: six products of parts round as float32 products do, and take
-half the time that this processor's float32 arithmetic takes (docs/performance.md).
+half the time that this processor's float32 arithmetic takes (docs/notes/performance.md).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 They lay the weights out once a product, add the bias and apply ELU before a sum ever leaves the processor, and give the
 gradients of weights in float32. Elsewhere these are torch's own products, but for the gradient of wide weights in bfloat16:
 oneDNN is slow where the left operand lies in memory the wrong way round. Laid out first, the narrower one of the two operands,
-it takes two thirds of the time (docs/performance-eager.md).
+it takes two thirds of the time (docs/notes/performance-eager.md).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import torch as th
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 #: ``"auto"``: from this size on bfloat16 is faster on a CPU with AMX tiles: the width of the model's features for each part
-#: (docs/performance.md has the measurements). Elsewhere float32, until somebody has measured it there. Acting without a
+#: (docs/notes/performance.md has the measurements). Elsewhere float32, until somebody has measured it there. Acting without a
 #: planner is one row at a time and always float32.
 AUTO_FEATURE_SIZE = {"update": 1024, "planner": 1024}
 

@@ -34,7 +34,7 @@ from sb3_dreamer_urlb.nn.precision import product_dtype
 from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
-#: float32, the second transposed one. Measured layer by layer (docs/performance-eager.md).
+#: float32, the second transposed one. Measured layer by layer (docs/notes/performance-eager.md).
 SMALL_SIDE = {th.float32: 5, th.bfloat16: 4}
 #: The same for products with one pass as phases: the third convolution and the second transposed one in bfloat16.
 MIDDLE_SIDE = {th.float32: 0, th.bfloat16: 6}

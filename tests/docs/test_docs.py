@@ -109,7 +109,7 @@ def test_guards_and_a_replay_on_disk(small_world, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
 def test_howto(small_world, tmp_path, page, monkeypatch):
-    blocks = code_blocks(page)
+    blocks = [block for block in code_blocks(page) if "package_to_hub" not in block]  # test_sharing
     assert blocks
     names = {"__name__": "howto"}
     monkeypatch.setitem(sys.modules, "howto", ModuleType("howto"))  # dataclasses look their module up
@@ -167,6 +167,16 @@ def test_cartpole(monkeypatch):
     assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
 
 
+@pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
+def test_a_howto_opens_with_what_takes_seconds(page):
+    """Before anything else: how the whole looks, at the size of tests."""
+    text = page.read_text()
+    assert re.findall(r"^## (.*)$", text, re.MULTILINE)[0] == "In 20 seconds", page.name
+    block = code_blocks(page)[0]
+    assert 'preset="tiny"' in block
+    assert max(int(number) for number in re.findall(r"(?:learn\(|steps=)\[?(\d+)", block) or ["0"]) <= 300
+
+
 def test_every_local_link_leads_somewhere():
     for page in PAGES:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
@@ -222,9 +232,9 @@ def test_logging_and_films(small_world, tmp_path, monkeypatch):
 
 
 def test_sharing(small_world, tmp_path):
-    [block] = code_blocks("docs/hub.md")
+    [block] = [block for block in code_blocks("docs/howto/share.md") if "package_to_hub" in block]
     block = block.replace('"./shared/walker-run",', f'"./shared/walker-run", {TASK}, env_id="urlb/walker-run-v0",')
-    names = run(block, {})
+    names = run(block, {"gymnasium": gymnasium, "DreamerV2": dreamer_v2.DreamerV2})
     assert Path(names["path"]) == Path("shared/walker-run/dreamerv2-urlb-walker-run-v0.zip")
     assert names["model"].phase == "finetuning" and "python train.py" in (tmp_path / "shared/walker-run/README.md").read_text()
 
