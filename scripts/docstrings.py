@@ -11,16 +11,23 @@ from typing import Any
 
 import griffe
 
+# An argument that begins with an underscore: SB3's own, or none of a user's business.
+PRIVATE_ARGUMENT = re.compile(r"^[ ]*:param _\w+:.*(?:\n[ ]+(?!:).*)*\n?", re.MULTILINE)
 ROLE = re.compile(r":(?:class|meth|func|attr|mod|exc|data):`(~?)([\w.]+)`")
 
 
 class Docstrings(griffe.Extension):
-    """Turns roles into links, and ``#:`` comments into docstrings."""
+    """Turns roles into links and ``#:`` comments into docstrings, and hides private arguments."""
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
         """A ``#:`` comment above an attribute describes it."""
         if attr.docstring is None and attr.lineno is not None and (text := _comment_above(attr)):
             attr.docstring = griffe.Docstring(text, parent=attr)
+
+    def on_function_instance(self, *, func: griffe.Function, **_: Any) -> None:
+        """Private arguments are not for the pages."""
+        for name in [parameter.name for parameter in func.parameters if parameter.name.startswith("_")]:
+            del func.parameters[name]
 
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """Everything is loaded, so that names can be looked up."""
@@ -40,7 +47,8 @@ def _comment_above(attr: griffe.Attribute) -> str:
 
 def _link_roles(obj: griffe.Object) -> None:
     if obj.docstring is not None:
-        obj.docstring.value = ROLE.sub(lambda match: _link(obj, match[1], match[2]), obj.docstring.value)
+        public = PRIVATE_ARGUMENT.sub("", obj.docstring.value)
+        obj.docstring.value = ROLE.sub(lambda match: _link(obj, match[1], match[2]), public)
     for member in obj.members.values():
         if isinstance(member, griffe.Object):
             _link_roles(member)

@@ -2,16 +2,20 @@
 
 README.md is the start page, changelog, security notes and the notebook are pages, and a Python file that a page links to
 becomes a page with its code. Links are rewritten to fit; whatever leads nowhere is left to MkDocs, which refuses it.
+
+Pages are also finished here: formulas become MathML, tables lose empty headers, long signatures are folded.
 """
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -21,10 +25,16 @@ PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
+    "CONTRIBUTING.md": "contributing.md",
     "examples/quickstart.ipynb": "quickstart.md",
 }
 # The target of a Markdown link or image that is neither a URL nor an anchor of the same page.
 LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#\s]+)")
+FORMULA = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
+EMPTY_HEADER = re.compile(r"<thead>\s*<tr>(?:\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
+SIGNATURE = re.compile(r'<div class="doc-signature highlight">.*?</div>', re.DOTALL)
+#: lines of a signature that are shown without a click
+SHOWN_LINES = 10
 
 
 def page_of(path: Path) -> str | None:
@@ -55,7 +65,9 @@ def text_of(path: Path) -> str:
     if path.suffix == ".ipynb":
         cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(text)["cells"]]
         return "\n\n".join(f"```python\n{source}\n```" if kind == "code" else source for source, kind in cells)
-    return f"# {path.name}\n\n`````python\n{text}`````\n" if path.suffix == ".py" else text
+    # Code needs the width.
+    hidden = "---\nhide:\n  - toc\n---\n\n"
+    return f"{hidden}# {path.name}\n\n`````python\n{text}`````\n" if path.suffix == ".py" else text
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:
@@ -84,3 +96,17 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         return match[0] if target is None else os.path.relpath(target, folder)
 
     return LINK.sub(moved, markdown)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Finish a page, once Markdown and docstrings have become HTML."""
+    content = FORMULA.sub(lambda match: convert(html.unescape(match[1]).strip(), display="block"), content)
+    content = EMPTY_HEADER.sub("", content)
+    return SIGNATURE.sub(lambda match: _folded(match[0]), content)
+
+
+def _folded(signature: str) -> str:
+    lines = signature.count("\n") - 1
+    if lines <= SHOWN_LINES:
+        return signature
+    return f'<details class="signature"><summary>Signature, {lines} arguments</summary>{signature}</details>'

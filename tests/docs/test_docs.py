@@ -136,7 +136,7 @@ def after_intrinsic_reward(names, folder):
     fresh = dreamer_v2.DreamerV2("CnnPolicy", names["env"], intrinsic_reward="embedding_error", seed=model.seed)
     weight = [m.policy.agent.intrinsic.error.out.weight for m in (model, fresh)]
     assert model.phase_updates > 0 and not weight[0].equal(weight[1])
-    assert "intrinsic_reward" in names["model"]._metrics.sums
+    assert "intrinsic_reward" in names["simple"]._metrics.sums
 
 
 def after_evaluate(names, folder):
