@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
+import xml.etree.ElementTree
 import zlib
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +25,9 @@ from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.intrinsic import registry
 
-OUTSIDE = [ROOT / name for name in ("README.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")]
+OUTSIDE = [
+    ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md", "examples/quickstart.ipynb")
+]
 PAGES = [*OUTSIDE, *sorted((ROOT / "docs").rglob("*.md"))]
 HOWTO = sorted((ROOT / "docs" / "howto").glob("*.md"))
 TASK = 'gymnasium.make("urlb/walker-run-v0")'
@@ -77,15 +81,12 @@ def run(block: str, names: dict) -> dict:
 
 
 def test_readme(small_world, tmp_path, capsys, monkeypatch):
-    first, second = code_blocks("README.md")
-    # At this size the only snapshot is the one the second example loads.
-    first = first.replace('SnapshotCallback("snapshots")', 'SnapshotCallback("snapshots", [480])')
-    names = run(first, {})
+    [block] = code_blocks("README.md")
+    assert len([line for line in block.splitlines() if line]) <= 12
+    names = run(block, {})
     assert small_world == ["urlb/walker-stand-v0", "urlb/walker-run-v0"]
     assert names["model"].phase == "finetuning" and names["model"]._planner_is_on()
     assert (tmp_path / "walker-run.zip").exists() and re.search(r"\(.*30\.0.*\)", capsys.readouterr().out)
-    names = run(second, names)
-    assert names["model"].phase == "finetuning" and names["model"].phase_timesteps >= 120
 
 
 def test_a_run_that_goes_on(small_world, tmp_path):
@@ -177,6 +178,25 @@ def test_a_howto_opens_with_what_takes_seconds(page):
     assert max(int(number) for number in re.findall(r"(?:learn\(|steps=)\[?(\d+)", block) or ["0"]) <= 300
 
 
+def test_code_fits_its_column():
+    """What a page of the site has room for on a desk."""
+    for page in (page for page in PAGES if page.suffix == ".md"):
+        for block in re.findall(r"```\w+\n(.*?)```", page.read_text(), re.DOTALL):
+            for line in block.splitlines():
+                assert len(line) <= 110, f"{page.name}: {line}"
+
+
+def test_pages_for_readers_stay_short():
+    for page, lines in (("performance", 150), ("results", 150)):
+        assert len((ROOT / "docs" / f"{page}.md").read_text().splitlines()) <= lines
+
+
+def test_the_method_is_drawn_by_its_script():
+    drawn = runpy.run_path(str(ROOT / "scripts" / "draw_method.py"))["draw"]()
+    assert (ROOT / "docs" / "images" / "method.svg").read_text() == drawn
+    xml.etree.ElementTree.fromstring(drawn)
+
+
 def test_every_local_link_leads_somewhere():
     for page in PAGES:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
@@ -193,6 +213,7 @@ def test_the_site(tmp_path):
     every_public_name_has_its_place(tmp_path)
     docstrings_look_as_they_are_meant(tmp_path)
     pages_and_code_come_from_outside_of_docs(tmp_path)
+    pages_are_finished(tmp_path)
 
 
 def every_public_name_has_its_place(site):
@@ -220,6 +241,23 @@ def pages_and_code_come_from_outside_of_docs(site):
     code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
     assert "class LBS" in re.sub(r"<[^>]*>", "", code)
     assert "PRETRAIN_FRAMES" in (site / "quickstart/index.html").read_text()
+
+
+def pages_are_finished(site):
+    algorithm = (site / "algorithm/index.html").read_text()
+    assert algorithm.count("<math") >= 3 and "arithmatex" not in algorithm and "$$" not in algorithm
+    for page in site.rglob("*.html"):
+        assert not re.search(r"<th[^>]*>\s*</th>\s*</tr>\s*</thead>\s*<tbody>\s*</tbody>", page.read_text()), page
+    empty = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
+    assert not [page for page in site.rglob("*.html") if empty.search(page.read_text())]
+    api = (site / "api/algorithm/index.html").read_text()
+    assert '<details class="signature">' in api and "_init_setup_model" not in re.sub(
+        r"<details class=\"mkdoc.*?</details>", "", api, flags=re.S
+    )
+    start = (site / "index.html").read_text()
+    assert start.count("data-md-color-media") >= 3  # a switch between light and dark
+    for address in re.findall(r'(?:src|href)="(https?://[^"]+\.(?:js|css|woff2?))"', start + algorithm):
+        raise AssertionError(f"the site would fetch {address}")
 
 
 def test_logging_and_films(small_world, tmp_path, monkeypatch):
