@@ -33,6 +33,8 @@ LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#\s]+)")
 FORMULA = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 EMPTY_HEADER = re.compile(r"<thead>\s*<tr>(?:\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
 SIGNATURE = re.compile(r'<div class="doc-signature highlight">.*?</div>', re.DOTALL)
+#: what becomes a page with its text, by its ending: the language to colour it by
+CODE = {".py": "python", ".cff": "yaml", "": "docker"}
 #: lines of a signature that are shown without a click
 SHOWN_LINES = 10
 
@@ -47,7 +49,7 @@ def page_of(path: Path) -> str | None:
     name = path.relative_to(ROOT).as_posix()
     if name.startswith("docs/"):
         return name.removeprefix("docs/")
-    return PAGES.get(name) or (f"source/{name}.md" if path.suffix == ".py" else None)
+    return PAGES.get(name) or (f"source/{name}.md" if path.suffix in CODE else None)
 
 
 def file_of(page: str) -> Path:
@@ -65,9 +67,11 @@ def text_of(path: Path) -> str:
     if path.suffix == ".ipynb":
         cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(text)["cells"]]
         return "\n\n".join(f"```python\n{source}\n```" if kind == "code" else source for source, kind in cells)
+    if path.suffix not in CODE:
+        return text
     # Code needs the width.
     hidden = "---\nhide:\n  - toc\n---\n\n"
-    return f"{hidden}# {path.name}\n\n`````python\n{text}`````\n" if path.suffix == ".py" else text
+    return f"{hidden}# {path.name}\n\n`````{CODE[path.suffix]}\n{text}`````\n"
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:

@@ -146,7 +146,8 @@ def test_the_page_names_what_exists():
         # Neither a run that goes on nor a task that is found needs a file.
         found = any(f"--env {task} " in options for task in entries(VECTORS)) or re.search(r"-i \S+_1$", options)
         named = command == "train" and not found
-        assert [(ROOT / path).is_file() for path in re.findall(r"-conf (\S+)", options)] == [True] * named
+        files = [ROOT / "zoo_configs" / f"{name}.yml" for name in re.findall(r"-conf (\S+)", options)]
+        assert [path.is_file() for path in files] == [True] * named
     [own] = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]).values()
     assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 3
 
