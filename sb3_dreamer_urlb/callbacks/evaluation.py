@@ -110,7 +110,7 @@ class EvaluationCallback(EvalCallback):
             raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:
             raise ValueError("Rows tell runs apart by their seed: give the model one, or columns={'seed': ...}.")
-        if self.planner == ON and self._dreamer.planner is None:
+        if self.planner == ON and getattr(self.model, "planner", None) is None:
             raise ValueError("planner='on': the model has none.")
         # An evaluation that was due before the run was cut off has been.
         self._due = (self._dreamer.phase, self._dreamer.phase_frames // self.every_frames)
@@ -145,7 +145,7 @@ class EvaluationCallback(EvalCallback):
     def _planners(self) -> tuple[str, ...]:
         if self.planner != BOTH:
             return (self.planner,)
-        return (OFF,) if self._dreamer.planner is None or PHASES[self._dreamer.phase].explores else (ON, OFF)
+        return (OFF,) if getattr(self.model, "planner", None) is None or PHASES[self._dreamer.phase].explores else (ON, OFF)
 
     def _write_row(self, evaluation: Evaluation) -> None:
         if self.rows is None:

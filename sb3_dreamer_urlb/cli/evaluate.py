@@ -59,7 +59,8 @@ def run(options: dict[str, Any]) -> int:
         env.close()
         raise ValueError("The model has no seed, and rows tell runs apart by it: --set seed=...")
     planner = options["planner"]
-    plan = ("on", "off") if planner == BOTH and model.planner is not None else ("off",) if planner == BOTH else (planner,)
+    both = ("off",) if getattr(model, "planner", None) is None else ("on", "off")
+    plan = both if planner == BOTH else (planner,)
     evaluations = []
     try:
         for chosen in plan:
@@ -85,8 +86,7 @@ def load_agent(options: dict[str, Any], envs: int) -> tuple[Any, VecEnv]:
     """
     from stable_baselines3.common.env_util import make_vec_env
 
-    from sb3_dreamer_urlb import DreamerV2
-    from sb3_dreamer_urlb.evaluation.loading import normalized_as_saved
+    from sb3_dreamer_urlb.evaluation.loading import algorithm_of, normalized_as_saved
     from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
     from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
 
@@ -97,7 +97,7 @@ def load_agent(options: dict[str, Any], envs: int) -> tuple[Any, VecEnv]:
     try:
         statistics = options.get("vec_normalize")
         env = normalized_as_saved(env, path) if statistics is None else load_vec_normalize(statistics, env)
-        return DreamerV2.load(path, env=env, device=options["device"]), env
+        return algorithm_of(path).load(path, env=env, device=options["device"]), env
     except BaseException:
         env.close()
         raise

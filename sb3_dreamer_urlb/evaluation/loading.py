@@ -1,11 +1,14 @@
-"""An environment whose observations are normalised as a saved agent's were."""
+"""Whose a snapshot is, and an environment whose observations are normalised as the agent's were."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+from sb3_dreamer_urlb.drq_v2 import DrQv2
 from sb3_dreamer_urlb.snapshots import normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, blaming, reading
 
@@ -29,3 +32,16 @@ def normalized_as_saved(env: VecEnv, snapshot: Path) -> VecEnv:
     with blaming(str(snapshot)):
         normalization.restore(wrapped, stored)
     return wrapped
+
+
+def algorithm_of(snapshot: Path) -> Any:
+    """The class of the algorithm that wrote a snapshot.
+
+    :param snapshot: of a model
+    :raises SnapshotError: naming the file and why it is refused
+    """
+    known: tuple[Any, ...] = (DreamerV2, DrQv2)
+    with reading(snapshot, "model") as archive:
+        arguments = set(archive.data["arguments"])
+    # Where none has them all, the first says what is wrong.
+    return next((one for one in known if arguments <= set(one.argument_names())), known[0])

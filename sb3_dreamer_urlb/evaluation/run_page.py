@@ -82,7 +82,7 @@ def _summary(facts: RunFacts) -> list[tuple[str, str]]:
         ("Domain", str(facts.data.get("domain") or "not told by the environment")),
         ("Pre-training", frames_label(counters.get("phase_frames", 0) if exploring else pretrained) + " frames"),
         ("Fine-tuning", frames_label(0 if exploring else counters.get("phase_frames", 0)) + " frames"),
-        ("Updates", str(counters.get("_n_updates", 0))),
+        ("Updates", str(counters.get("n_updates", 0))),
         ("Skipped updates", str(counters.get("skipped_updates", 0))),
         ("Faults of environments", str(counters.get("env_faults", 0))),
     ]

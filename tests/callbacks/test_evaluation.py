@@ -13,7 +13,7 @@ from fake_envs import CounterEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
+from sb3_dreamer_urlb import DreamerV2, DrQv2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 
@@ -158,6 +158,21 @@ def test_the_command_takes_a_run_folder_with_its_statistics(tiny_model: Any, tmp
     evaluation.init_callback(model)
     evaluation.evaluate()
     assert row.return_mean == pytest.approx(evaluation.last_mean_reward, rel=1e-4)
+
+
+def test_the_model_free_agent_is_evaluated_alike(tmp_path: Path) -> None:
+    model = DrQv2("CnnPolicy", CounterEnv(20, size=84, **WALKER), preset="tiny", seed=0, device="cpu")
+    rows = tmp_path / "rows.csv"
+    model.learn(20, callback=EvaluationCallback(CounterEnv(5, size=84, **WALKER), 20, 1, rows, planner="both"))
+    model.save(tmp_path / "agent")
+    command = ["evaluate", str(tmp_path / "agent.zip"), "--env", "Counter-v0", "--env-kwargs", "size=84", "length=5"]
+    command += ["--episodes", "1", "--device", "cpu", "--set", "arm=again", "--planner", "both"]
+    assert main([*command, "--rows", str(rows)]) == 0
+    assert [(row.method, row["algorithm"], row.planner, row.finetune_frames) for row in read_rows(rows).rows] == [
+        ("drqv2", "DrQv2", "none", 20),
+        ("drqv2", "DrQv2", "none", 40),
+        ("drqv2", "DrQv2", "none", 40),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from sb3_dreamer_urlb import EvaluationCallback, PhaseSwitchCallback, RunCheckpo
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.run_facts import read_run, thinned
+from sb3_dreamer_urlb.evaluation.run_page import _summary
 
 SECTIONS = ("summary", "warnings", "evaluation", "films", "curves", "repeat", "configuration", "environment", "versions")
 WALKER = {"domain": "walker", "task": "run", "action_repeat": 2}
@@ -89,6 +90,8 @@ def test_the_page_has_all_its_parts_and_needs_no_network(run: Path) -> None:
     ):
         assert part in page.text, part
     assert "None: no update was skipped" in page.text
+    facts = dict(_summary(read_run(run)))
+    assert int(facts["Updates"]) > 0 and facts["Pre-training"] == "120 frames" and facts["Fine-tuning"] != "0 frames"
 
 
 def test_the_switch_of_phases_is_known(run: Path) -> None:
