@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from abc import abstractmethod
 from contextlib import ExitStack
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.algorithm import checks, training_loop
+from sb3_dreamer_urlb.algorithm import checks, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
@@ -24,6 +25,12 @@ from sb3_dreamer_urlb.number_checks import plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.types import MetricMeans
+
+
+@functools.cache
+def _argument_names(algorithm: type[PhasedAlgorithm]) -> frozenset[str]:
+    return frozenset(algorithm.argument_names())
+
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
@@ -90,6 +97,39 @@ class PhasedAlgorithm(CollectingAlgorithm):
         #: of the updates since the last line of the log
         self._metrics = MetricMeans()
         self._logged_phase: str | None = None
+
+    # -- hyperparameters -----------------------------------------------------------------------------------------------
+
+    #: arguments that are in force from the next step or update on when they are assigned; None lets all be assigned unchecked
+    assignable: ClassVar[frozenset[str] | None] = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """What a model says of its arguments is what is in force, for files state it.
+
+        :raises AttributeError: for an argument that networks or replay were built with
+        :raises ValueError: for a value that does not fit; the old one stays
+        """
+        if self.assignable is None or "policy" not in vars(self) or name not in _argument_names(type(self)):
+            super().__setattr__(name, value)
+            return
+        if name not in self.assignable:
+            raise AttributeError(
+                f"{name} cannot be assigned: the model was built with {name}={vars(self).get(name)!r}. "
+                f"To change it: {type(self).__name__}.load(path, {name}=...)."
+            )
+        before = vars(self)[name]
+        super().__setattr__(name, plain(value))
+        try:
+            self._put_in_force()
+        except Exception:
+            super().__setattr__(name, before)
+            raise
+
+    def _put_in_force(self) -> None:
+        """An argument was assigned: check all of them, and tell the parts that hold a copy.
+
+        :raises ValueError: for a value that does not fit; nothing is told yet
+        """
 
     # -- set-up --------------------------------------------------------------------------------------------------------
 
@@ -181,7 +221,9 @@ class PhasedAlgorithm(CollectingAlgorithm):
                 "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
             )
         if env is not None:
+            before, env = self._vec_normalize_env, self.prepare_fine_tuning_env(env)
             self.set_env(env)
+            normalized.carry_over(before, self._vec_normalize_env)
         if keep_actor is None:
             keep_actor = self._keeps_actor()
         pretrained = self.policy
@@ -196,6 +238,17 @@ class PhasedAlgorithm(CollectingAlgorithm):
     def _keeps_actor(self) -> bool:
         """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule."""
         return phases.keeps_actor(self.domain)
+
+    def prepare_fine_tuning_env(self, env: GymEnv) -> VecEnv:
+        """As :meth:`prepare_env`; also checks that the pre-trained model will be shown what it knows.
+
+        :param env: vectorised or not
+        :raises ValueError: if it does not fit
+        """
+        wrapped = self.prepare_env(env)
+        if self.env is not None:
+            normalized.check(self._vec_normalize_env, unwrap_vec_normalize(wrapped))
+        return wrapped
 
     @abstractmethod
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:

@@ -53,7 +53,7 @@ class PhaseSwitchCallback(BaseCallback):
         if self.env is None:
             return
         # Now, not after the 2M frames of pre-training.
-        self.env = model.prepare_env(self.env)
+        self.env = model.prepare_fine_tuning_env(self.env) if model.phase == PRETRAINING else model.prepare_env(self.env)
         resumed = model.run_folder is not None and model.run_folder.resumed
         if resumed and model.phase != PRETRAINING and model.get_env() is not self.env:
             # The run was resumed after the switch, with the pre-training's environment.

@@ -58,6 +58,15 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "precision",
     "compile",
 }
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.PhasedAlgorithm.assignable`
+ASSIGNABLE = frozenset(
+    {
+        "learning_rate", "actor_learning_rate", "critic_learning_rate", "adam_eps", "max_grad_norm", "weight_decay",
+        "batch_size", "imagination_horizon", "gamma", "gae_lambda", "ent_coef", "free_nats", "kl_balance", "kl_scale",
+        "target_update_interval", "learning_starts", "train_freq", "gradient_steps", "skill_selection_starts",
+        "planner", "planner_kwargs", "planner_delay", "action_noise", "overlap", "verbose", "tensorboard_log",
+    }
+)  # fmt: skip
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
 

@@ -112,6 +112,7 @@ class DreamerV2(AgentAlgorithm):
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy_class: type[DreamerPolicy]
+    assignable = arguments.ASSIGNABLE
     policy: DreamerPolicy
     learner: Learner
     intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None
@@ -227,6 +228,16 @@ class DreamerV2(AgentAlgorithm):
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
         graphs.warn_if_in_vain(self.compile, self.device)
 
+    def _put_in_force(self) -> None:
+        arguments.check(self)
+        planner = self._new_planner()
+        self._setup_lr_schedule()
+        self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
+        self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
+        self._convert_train_freq()
+        self.policy.set_numbers(self.gamma, planner)
+        self.learner.configure(self._learner_config(self.policy.agent.intrinsic))
+
     def _read_env(self) -> None:
         super()._read_env()
         if self.env is not None and self.discount_head is None:
@@ -258,11 +269,14 @@ class DreamerV2(AgentAlgorithm):
             discount_head=bool(self.discount_head),
             intrinsic=self._intrinsic(),
             explores=phases.PHASES[self.phase].explores,
-            planner=make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes),
+            planner=self._new_planner(),
             precision=self.precision,
             compile=self.compile,
             **self.policy_kwargs,
         )
+
+    def _new_planner(self) -> Planner | None:
+        return make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes)
 
     def _intrinsic(self) -> IntrinsicReward | None:
         """What the current phase explores with; fine-tuning keeps only what has skills."""

@@ -164,6 +164,17 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         """Format of the planner's products."""
         return precisions.choose(self.precision, "planner", self.device, self.agent.world_model.sizes.feature)
 
+    def set_numbers(self, gamma: float, planner: Planner | None) -> None:
+        """Act with other numbers from now on.
+
+        :param gamma: discount factor
+        :param planner: None lets the actor act
+        """
+        self.agent.world_model.gamma = self._constructor_sizes["gamma"] = gamma
+        self._planner = planner
+        # A recording holds the old ones.
+        self._recorders = None
+
     # -- acting --------------------------------------------------------------------------------------------------------
 
     def initial_state(self, n: int) -> ActingState:

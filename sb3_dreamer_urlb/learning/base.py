@@ -54,6 +54,13 @@ class BaseLearner(Generic[AnyAgent, Batch]):
         :param recorded: what may say, with ``graph_safe = False``, that an update cannot be recorded
         """
         self.guard = UpdateGuard(self.optimizers(), statistics)
+        self._record_anew(recorded)
+
+    def _record_anew(self, recorded: nn.Module | None) -> None:
+        """Forget recordings of updates.
+
+        :param recorded: see :meth:`_get_ready`
+        """
         self.recorder = Recorder(self._update, make_backend(self._compile, self.device), self._memory, "The update")
         if not getattr(recorded, "graph_safe", True):
             self.recorder.give_up(f"{type(recorded).__name__}.graph_safe is False")

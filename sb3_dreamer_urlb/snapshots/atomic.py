@@ -62,9 +62,15 @@ def path_to_read(path: str | os.PathLike[str], suffix: str) -> Path:
     """As Stable-Baselines3 finds files: ``suffix`` is added where the path itself does not exist.
 
     :raises FileNotFoundError: if neither exists
+    :raises IsADirectoryError: for a folder
     """
     path = Path(path)
     for candidate in (path, Path(f"{path}.{suffix}")):
         if candidate.is_file():
             return candidate
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{path} is a folder, load() takes a file: a run folder goes on with DreamerV2.resume({str(path)!r}, env), "
+            "what was pushed to the Hub is read by sb3_dreamer_urlb.hub.load_from_hub."
+        )
     raise FileNotFoundError(2, "No such file", str(path))

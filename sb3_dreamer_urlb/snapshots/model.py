@@ -5,6 +5,7 @@ Not in the file: the replay (``save_replay_buffer``, or a run folder), the envir
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, TypeVar
 
 import torch as th
@@ -13,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_device, get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.snapshots import normalization, tensors
+from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
@@ -23,6 +24,8 @@ Model = TypeVar("Model", bound=SavedAlgorithm)
 
 KIND = "model"
 MOMENTS = ("exp_avg", "exp_avg_sq")
+#: what ``torch.compile`` puts before the names of what a module holds
+COMPILED = "_orig_mod."
 
 
 # -- saving ----------------------------------------------------------------------------------------------------------------
@@ -34,15 +37,44 @@ def save(model: SavedAlgorithm, target: Target, run: dict[str, Any] | None = Non
     :param model: what to save
     :param target: path (``.zip`` is added where it has no suffix), or binary file object
     :param run: what a run folder adds, JSON
-    :raises ValueError: if a weight is not finite; the old file stays
+    :raises ValueError: if a weight is not finite, or the file could not be read again; the old file stays
     :raises OSError: naming the path; the old file stays
     """
     # Who saves a model alone saves its VecNormalize apart, as with every algorithm of SB3.
     statistics = {} if run is None else normalization.pack(model.get_vec_normalize_env())
-    content = tensors.pack({**_all_tensors(model), **statistics})
+    mine, data = _all_tensors(model), describe(model, run)
+    content = tensors.pack({**mine, **statistics})
+    _check_readable(model, data, tensors.table_of(mine))
+    if run is None and (missing := needed(data)):
+        warnings.warn(
+            f"No file can hold this model's {', '.join(missing)}: load() will ask for it again, "
+            f"load(..., custom_objects={{{missing[0]!r}: ...}})."
+        )
     with writing(target, KIND) as writer:
         writer.add(TENSORS, content)
-        writer.finish(describe(model, run))
+        writer.finish(data)
+
+
+def _check_readable(model: SavedAlgorithm, data: dict[str, Any], found: tensors.Table) -> None:
+    """Try on what is about to be written what :func:`load` will do with it.
+
+    :param model: that is saved
+    :param data: its JSON
+    :param found: table of its tensors
+    :raises ValueError: if it would be refused
+    """
+    own: dict[str, Any] = {**model.arguments(), "policy": model.policy_class}
+    try:
+        data = bounded_json.parse(bounded_json.dump(data))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            twin = blank(type(model), data, model.device, {name: own[name] for name in needed(data) if name in own}, {})
+            restore_fields(twin, data)
+            twin._prepare()
+            described = tensors.table_without_memory(twin._new_policy, found)
+        tensors.compare(found, _with_moments(model, {f"policy.{name}": entry for name, entry in described.items()}, found))
+    except (ValueError, TypeError, AttributeError, AssertionError, LookupError) as error:
+        raise ValueError(f"The model is not saved, for its file would be refused: {error}") from error
 
 
 def _all_tensors(model: SavedAlgorithm) -> dict[str, th.Tensor]:
@@ -59,7 +91,13 @@ def _parameters(adam: th.optim.Adam) -> list[th.nn.Parameter]:
 
 
 def _named(policy: th.nn.Module) -> dict[str, th.Tensor]:
-    return {f"policy.{name}": value for name, value in policy.state_dict().items()}
+    return {f"policy.{name.replace(COMPILED, '')}": value for name, value in policy.state_dict().items()}
+
+
+def _load_weights(policy: th.nn.Module, named: dict[str, th.Tensor]) -> None:
+    """Undo :func:`_named`; names that are missing keep their values."""
+    given = {name: f"policy.{name.replace(COMPILED, '')}" for name in policy.state_dict()}
+    policy.load_state_dict({name: named[theirs] for name, theirs in given.items() if theirs in named}, strict=False)
 
 
 # -- loading ---------------------------------------------------------------------------------------------------------------
@@ -127,7 +165,7 @@ def _prepared(
     :raises CallersError: if the file alone would have been in order
     """
 
-    def prepare(custom: dict[str, Any], kwargs: dict[str, Any]) -> Model:
+    def prepare(custom: dict[str, Any], kwargs: dict[str, Any], env: VecEnv | None = None) -> Model:
         model = blank(algorithm, data, device, custom, kwargs)
         restore_fields(model, data)
         if env is not None:
@@ -138,9 +176,9 @@ def _prepared(
         return model
 
     try:
-        return prepare(custom, kwargs)
+        return prepare(custom, kwargs, env)
     except Exception as error:
-        if not custom and not kwargs:
+        if not custom and not kwargs and env is None:
             raise
         given = {**custom, **kwargs}
         try:
@@ -178,7 +216,7 @@ def _put(model: SavedAlgorithm, loaded: dict[str, th.Tensor]) -> None:
     for name, value in loaded.items():
         if name.endswith((".step", ".exp_avg_sq")) and not name.startswith("policy.") and bool((value < 0).any()):
             raise ValueError(f"the tensor {name!r} holds negative values")
-    model.policy.load_state_dict({name.removeprefix("policy."): v for name, v in loaded.items() if name.startswith("policy.")})
+    _load_weights(model.policy, loaded)
     for name, adam in model.adams().items():
         state = {
             i: {key: loaded[f"{name}.{i}.{key}"] for key in ("step", *MOMENTS)}
@@ -208,4 +246,4 @@ def set_parameters(model: SavedAlgorithm, source: Target, exact_match: bool) -> 
         common = own.keys() & found.keys()
         tensors.compare({name: found[name] for name in common}, {name: own[name] for name in common})
         loaded = tensors.unpack(archive, TENSORS)
-        model.policy.load_state_dict({name.removeprefix("policy."): loaded[name] for name in common}, strict=False)
+        _load_weights(model.policy, {name: loaded[name] for name in common})

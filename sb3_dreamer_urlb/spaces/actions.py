@@ -42,7 +42,7 @@ class BoxActions(Actions):
     """Numbers, scaled from the space's bounds to [-1, 1].
 
     :param space: with finite bounds
-    :raises UnsupportedSpaceError: if a dimension has no range
+    :raises UnsupportedSpaceError: if a dimension has no range, or an infinite one
     """
 
     def __init__(self, space: spaces.Box):
@@ -50,19 +50,26 @@ class BoxActions(Actions):
             raise UnsupportedSpaceError(
                 f"Every action dimension needs low < high, got {space} with low={space.low}, high={space.high}."
             )
+        # Not the difference of two bytes, which overflows.
+        kind = space.low.dtype if space.low.dtype.kind == "f" else np.float64
+        with np.errstate(over="ignore"):
+            self.range = space.high.astype(kind) - space.low.astype(kind)
+        if not np.isfinite(self.range).all():
+            # ±float32.max is how an unbounded space is written by many.
+            raise UnsupportedSpaceError(f"Actions need finite bounds that are not the largest numbers there are, got {space}.")
         self.space = space
         self.size = int(np.prod(space.shape))
 
     def to_env(self, action: np.ndarray) -> np.ndarray:
         space = self.space
-        scaled = space.low + 0.5 * (action.reshape((-1, *space.shape)) + 1.0) * (space.high - space.low)
+        scaled = space.low + 0.5 * (action.reshape((-1, *space.shape)) + 1.0) * self.range
         if np.issubdtype(space.dtype, np.integer):
             scaled = np.rint(scaled)
         return np.clip(scaled, space.low, space.high).astype(space.dtype)
 
     def from_env(self, action: np.ndarray) -> np.ndarray:
         space = self.space
-        scaled = 2.0 * ((action - space.low) / (space.high - space.low)) - 1.0
+        scaled = 2.0 * (np.subtract(action, space.low, dtype=self.range.dtype) / self.range) - 1.0
         return scaled.reshape(-1, self.size).astype(np.float32)
 
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:

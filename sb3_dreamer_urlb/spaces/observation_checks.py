@@ -43,7 +43,19 @@ def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
         raise ValueError(
             f"{name} must have the shape {shape}, its channels first or last, or with a leading n: got {array.shape}."
         )
-    return array
+    _check_classes(name, array, space)
+    # Views with negative strides (a mirrored image) are arrays that torch does not take.
+    return np.ascontiguousarray(array).reshape(array.shape)
+
+
+def _check_classes(name: str, array: np.ndarray, space: spaces.Space[Any]) -> None:
+    """:raises ValueError: for numbers that are none of the space's classes, which torch would only say is out of bounds"""
+    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        return
+    least, count = (space.start, space.n) if isinstance(space, spaces.Discrete) else (space.start, space.nvec)
+    wrong_shape = array.ndim < len(space.shape or ()) or (space.shape and array.shape[-len(space.shape) :] != space.shape)
+    if not wrong_shape and not ((array >= least) & (array < least + count)).all():
+        raise ValueError(f"{name} must be in {space}, got {str(array.tolist())[:80]}.")
 
 
 def _shown(value: Any) -> str:

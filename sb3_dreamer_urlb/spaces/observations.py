@@ -62,7 +62,8 @@ class Images(Observations):
                 "VecNormalize(norm_obs=False) for images; for dm_control tasks gymnasium.make('urlb/<domain>-<task>-v0')."
             )
         low, high = float(space.low.min()), float(space.high.max())
-        if not np.isfinite([low, high]).all():
+        # ±float32.max is how an unbounded space is written by many.
+        if not np.isfinite(np.float32(high) - np.float32(low)):
             raise UnsupportedSpaceError(f"Images need finite bounds, got {space}.")
         least, most = IMAGE_SIZES
         if not is_image_space_channels_first(space):
@@ -119,12 +120,15 @@ class Numbers(Vectors):
 
     :param space: Box or MultiBinary
     :param normalize_images: divide images
+    :raises UnsupportedSpaceError: if there are none
     """
 
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         assert space.shape is not None
         self.shape = space.shape
         self.size = int(np.prod(self.shape))
+        if self.size == 0:
+            raise UnsupportedSpaceError(f"The observation space holds no number: {space}.")
         self.scale = 255.0 if normalize_images and is_image_space(space) else 1.0
 
     def preprocess(self, raw: Observation) -> Observation:

@@ -1,0 +1,89 @@
+"""What a model says of its arguments is in force: assigning takes effect in the next update, or is refused."""
+
+from __future__ import annotations
+
+import pytest
+from stable_baselines3.common.noise import NormalActionNoise
+
+from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.dreamer_v2.arguments import ASSIGNABLE
+
+#: another value for each, and where it is in force
+VALUES = {
+    "learning_rate": 2e-4,
+    "actor_learning_rate": 1e-9,
+    "critic_learning_rate": 0.0,
+    "adam_eps": 1e-3,
+    "max_grad_norm": 1.0,
+    "weight_decay": 1e-3,
+    "batch_size": 3,
+    "imagination_horizon": 5,
+    "gamma": 0.5,
+    "gae_lambda": 0.5,
+    "ent_coef": 0.25,
+    "free_nats": 0.5,
+    "kl_balance": 0.25,
+    "kl_scale": 2.0,
+    "target_update_interval": 7,
+    "learning_starts": 12,
+    "train_freq": 2,
+    "gradient_steps": 2,
+    "skill_selection_starts": 20,
+    "planner": "mppi",
+    "planner_kwargs": {"iterations": 1},
+    "planner_delay": 3,
+    "action_noise": NormalActionNoise([0.0, 0.0], [0.1, 0.1]),
+    "overlap": False,
+    "verbose": 0,
+    "tensorboard_log": None,
+}
+
+
+def in_force(model):
+    """What trains and plans, as far as it keeps numbers of its own."""
+    config, optimizer = model.learner.config, model.learner.model_optimizer
+    planner = model.policy.planner
+    return {
+        **{name: getattr(config, name) for name in VALUES if hasattr(config, name)},
+        "optimizer": (optimizer.eps, optimizer.max_grad_norm, optimizer.weight_decay),
+        "rates": [one.learning_rate for one in model.learner.optimizers().values()],
+        "gamma": model.policy.agent.world_model.gamma,
+        "planner": (type(planner).__name__, planner.config, planner.gae_lambda),
+        "train_freq": model.train_freq,
+    }
+
+
+def test_the_values_are_all_there_are():
+    assert VALUES.keys() == ASSIGNABLE
+
+
+@pytest.mark.parametrize("name", sorted(ASSIGNABLE))
+def test_an_assigned_model_is_one_that_was_made_so(tiny_model, tmp_path, name):
+    value = VALUES[name]
+    assigned, made = tiny_model(planner="dyna_mpc"), tiny_model(**{"planner": "dyna_mpc", name: value})
+    if name == "planner_kwargs":
+        value = made.planner_kwargs
+    setattr(assigned, name, value)
+    for model in (assigned, made):
+        model.learn(24)
+    assert in_force(assigned) == in_force(made)
+    assigned.save(tmp_path / "m")
+    assert in_force(DreamerV2.load(tmp_path / "m", device="cpu")) | {"rates": 0} == in_force(made) | {"rates": 0}
+
+
+@pytest.mark.parametrize("name", sorted(set(DreamerV2.argument_names()) - ASSIGNABLE - {"stats_window_size"}))
+def test_what_was_built_is_not_assigned(tiny_model, name):
+    model = tiny_model()
+    before = getattr(model, name)
+    with pytest.raises(AttributeError, match=rf"{name} cannot be assigned.*load\(path, {name}=\.\.\.\)"):
+        setattr(model, name, before)
+    assert getattr(model, name) is before
+
+
+@pytest.mark.parametrize(("name", "value"), [("ent_coef", -1), ("gamma", "x"), ("batch_size", 0), ("learning_rate", None)])
+def test_bad_values_leave_the_old_ones(tiny_model, name, value):
+    model = tiny_model(planner="dyna_mpc")
+    before, force = getattr(model, name), in_force(model)
+    with pytest.raises(ValueError, match=name):
+        setattr(model, name, value)
+    assert getattr(model, name) == before and in_force(model) == force
