@@ -69,7 +69,7 @@ class BoxActions(Actions):
 
     def from_env(self, action: np.ndarray) -> np.ndarray:
         space = self.space
-        scaled = 2.0 * (np.subtract(action, space.low, dtype=self.range.dtype) / self.range) - 1.0
+        scaled: np.ndarray = 2.0 * (np.subtract(action, space.low, dtype=self.range.dtype) / self.range) - 1.0
         return scaled.reshape(-1, self.size).astype(np.float32)
 
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
