@@ -12,7 +12,7 @@ import gymnasium
 from sb3_dreamer_urlb.envs import perturbations as rwrl
 from sb3_dreamer_urlb.envs.options import PixelOptions, refuse_unknown
 from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
-from sb3_dreamer_urlb.envs.registration import URLB_TASKS, check_urlb_task
+from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task
 from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def _show(
     in_window = options.render_mode == "human"
     if in_window:
         options = dataclasses.replace(options, render_mode="rgb_array")
-    is_urlb = task in URLB_TASKS.get(domain, ())
+    is_urlb = task in URLB_TASKS.get(domain, ()) or (domain == "jaco" and task in JACO_VARIANT_TASKS)
     env = _kind_of_env(options.observation)(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
     if perturbed_by is not None:
         from sb3_dreamer_urlb.envs.perturbation_wrapper import perturb
@@ -237,6 +237,7 @@ def make_control_env(domain: str, task: str) -> control.Environment | composer.E
     known["manipulation"] = tuple(manipulation.ALL)
     for name, tasks in URLB_TASKS.items():
         known[name] = (*tasks, *(other for other in known.get(name, ()) if other not in tasks))
+    known["jaco"] += JACO_VARIANT_TASKS
     if domain not in known:
         raise ValueError(f"domain={domain!r}: expected one of {', '.join(sorted(known))}")
     if task not in known[domain]:

@@ -16,6 +16,12 @@ URLB_TASKS: dict[str, tuple[str, ...]] = {
 #: Bodies that the Real-World RL suite's levels are of; its task is walk.
 RWRL_DOMAINS = ("walker", "quadruped")
 
+#: What a Jaco task's name may end with: the target cannot move the reward; a smaller and a larger rewarded area.
+JACO_VARIANTS = ("fixed", "sparse", "dense")
+
+#: The Jaco tasks' variants by name, of the paper's extended analysis.
+JACO_VARIANT_TASKS = tuple(f"{task}-{variant}" for task in URLB_TASKS["jaco"] for variant in JACO_VARIANTS)
+
 DOMAINS: tuple[str, ...] = tuple(URLB_TASKS)
 
 #: The task whose environment an agent is pre-trained in, one a domain; its reward is not used.
@@ -42,7 +48,8 @@ def check_urlb_task(domain: str, task: str) -> None:
 
 
 def register_envs() -> None:
-    """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, ``rwrl/<domain>-walk-<level>-v0`` of the
+    """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, the Jaco tasks' variants,
+    ``rwrl/<domain>-walk-<level>-v0`` of the
     Real-World RL suite, and ``urlb/dm_control-v0`` for any other
     task of dm_control (``gymnasium.make("urlb/dm_control-v0", domain="cartpole", task="swingup")``).
 
@@ -53,6 +60,8 @@ def register_envs() -> None:
         for task in tasks:
             _register(env_id(domain, task), "make_urlb_env", {"domain": domain, "task": task})
     _register("urlb/dm_control-v0", "make_dmc_env", {})
+    for task in JACO_VARIANT_TASKS:
+        _register(f"urlb/jaco-{task}-v0", "make_dmc_env", {"domain": "jaco", "task": task})
     for domain in RWRL_DOMAINS:
         for level in LEVELS:
             _register(f"rwrl/{domain}-walk-{level}-v0", "make_rwrl_env", {"domain": domain, "task": "walk", "level": level})

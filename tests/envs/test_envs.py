@@ -48,7 +48,8 @@ def test_the_names():
     assert DOMAINS == ("walker", "quadruped", "jaco") and len(TASKS) == 12
     assert all(PRIMAL_TASK[domain] in URLB_TASKS[domain] for domain in DOMAINS)
     registered = {name for name in gymnasium.registry if name.startswith("urlb/")}
-    assert registered == {env_id(domain, task) for domain, task in TASKS} | {"urlb/dm_control-v0"}
+    variants = {f"urlb/jaco-{task}-{kind}-v0" for task in URLB_TASKS["jaco"] for kind in ("fixed", "sparse", "dense")}
+    assert registered == {env_id(domain, task) for domain, task in TASKS} | {"urlb/dm_control-v0"} | variants
     assert all(isinstance(gymnasium.spec(name).entry_point, str) for name in registered)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
