@@ -13,7 +13,7 @@ from typing import Any
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
-MODULES = ("compare", "evaluate", "figures", "report")
+MODULES = ("compare", "evaluate", "figures", "report", "tasks")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

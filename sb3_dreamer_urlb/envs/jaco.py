@@ -34,8 +34,8 @@ _BRICK_XY = {
     "reach_bottom_right": (0.09, -0.09),
 }
 
-# Metres within which the reward is 1, and from there on to 0.1. The paper gives no numbers for its sparser and denser variants,
-# only that their maximum is the same: half and twice the benchmark's are our choice.
+# Metres within which the reward is 1, and from there on to 0.1. The paper gives no numbers for its sparser and denser
+# variants, only that their maximum is the same: half and twice the benchmark's are our choice.
 _REWARDED = {"": (0.05, 0.05), "fixed": (0.05, 0.05), "sparse": (0.025, 0.025), "dense": (0.1, 0.1)}
 
 
