@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from typing import Any
 
@@ -14,6 +13,7 @@ from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 
 #: range of a number: (low, low allowed, high, high allowed)
@@ -130,7 +130,7 @@ def check_policy_kwargs(model: SavedAlgorithm, filled_in: set[str]) -> None:
     :param filled_in: arguments of the policy that the algorithm fills in itself
     :raises ValueError: for arguments that the policy has not
     """
-    known = set(inspect.signature(model.policy_class.__init__).parameters) - filled_in
+    known = set(named_parameters(model.policy_class)) - filled_in
     unknown = sorted(set(model.policy_kwargs) - known)
     if unknown:
         raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")

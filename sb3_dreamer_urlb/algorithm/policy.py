@@ -164,7 +164,8 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
         with th.no_grad():
             memory = self.choose(self.observe(tensor, memory, is_first, generator), deterministic, generator)
         action = self.to_env_action(memory.action.cpu().numpy())
-        return action if vectorized else action[0], memory.to_numpy()
+        # An array in any case, as SB3's: indexing would make a scalar of a single choice.
+        return action if vectorized else action.squeeze(0), memory.to_numpy()
 
     def _generator_of(self, state: tuple[np.ndarray, ...] | None, starts: np.ndarray) -> th.Generator | None:
         """What a deterministic prediction draws from; None for agents that draw nothing.
@@ -189,8 +190,14 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = batch_size(observation)
         is_first = th.ones(n, dtype=th.bool, device=self.device)
-        return self.choose(self.observe(observation, self.initial_state(n), is_first), deterministic).action
+        generator = self._generator_of(None, np.ones(n, bool)) if deterministic else None
+        state = self.observe(observation, self.initial_state(n), is_first, generator)
+        return self.choose(state, deterministic, generator).action
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """The agent's actions at the beginning of an episode, (n, A)."""
+        """The agent's actions at the beginning of an episode, (n, A): those of :meth:`predict` before the space's form.
+
+        :param observation: tensors, (n, …), images with channels first
+        :param deterministic: without exploration, and with equal draws for equal inputs
+        """
         return self._predict(observation, deterministic)

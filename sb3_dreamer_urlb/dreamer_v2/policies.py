@@ -116,8 +116,8 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         for name, size in [*sizes.items(), *((f"net_arch[{i}]", width) for i, width in enumerate(net_arch))]:
             if not is_integer(size) or size < 1:
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
-        if len(net_arch) == 0:
-            raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
+        #: widths of the hidden layers; without any, every network that has nothing to convolve is linear
+        self.net_arch = net_arch
         if planner is not None and planner.classes != self.actions.classes:
             raise ValueError(f"The planner chooses among the classes {planner.classes}, the actions are {action_space}.")
         world_model = WorldModel(

@@ -6,7 +6,8 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv
+import gymnasium
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_dreamer_urlb.number_checks import is_integer, plain
 
@@ -49,8 +50,26 @@ def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
 
 
 def steps_an_episode(env: VecEnv) -> int | None:
-    """After how many steps the environment ends an episode; None where it does not tell."""
-    steps = env_fact(env, "max_episode_steps", None)
-    if steps is None:
-        steps = plain(getattr(env_attribute(env, "spec", None), "max_episode_steps", None))
-    return steps if _is_count(steps) else None
+    """After how many steps the environment ends an episode: what ends it first, of all that count; None where nothing tells.
+
+    The environment's own number, its spec's (``gymnasium.make(..., max_episode_steps=...)``), and those of the wrappers.
+    Of wrappers in other processes only the outermost is heard.
+    """
+    spec = env_attribute(env, "spec", None)
+    counts = [env_fact(env, "max_episode_steps", None), env_attribute(env, "_max_episode_steps", None)]
+    counts.append(getattr(spec, "max_episode_steps", None))
+    for wrapper in getattr(spec, "additional_wrappers", ()):
+        counts.append((wrapper.kwargs or {}).get("max_episode_steps"))
+    if isinstance(env.unwrapped, DummyVecEnv):
+        counts += _counts_of_wrappers(env.unwrapped.envs[0])
+    return min((int(count) for count in map(plain, counts) if _is_count(count)), default=None)
+
+
+def _counts_of_wrappers(env: gymnasium.Env[Any, Any]) -> list[Any]:
+    """Of those that do not hand their arguments to the spec, or have none to hand them to."""
+    counts = []
+    while True:
+        counts += [vars(env).get(name) for name in ("max_episode_steps", "_max_episode_steps")]
+        if not isinstance(env, gymnasium.Wrapper):
+            return counts
+        env = env.env

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import sys
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ import torch as th
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
+from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.version import __version__, how_to_install
 
@@ -262,7 +262,7 @@ def who_registers(env_id: str) -> tuple[list[str], bool]:
 
 def changed_arguments(model: DreamerV2) -> dict[str, Any]:
     """Constructor arguments that are not the defaults, as JSON."""
-    signature = inspect.signature(type(model).__init__).parameters
+    signature = named_parameters(type(model))
     kind = type(model.policy)
     aliases = [alias for alias, known in model.policy_aliases.items() if known is kind]
     found: dict[str, Any] = {"policy": (aliases or [kind.__name__])[0]}

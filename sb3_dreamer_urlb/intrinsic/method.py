@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, ClassVar
 
 from torch import nn
+
+from sb3_dreamer_urlb.signatures import named_arguments
 
 
 class ExplorationMethod(nn.Module):
@@ -26,7 +27,6 @@ class ExplorationMethod(nn.Module):
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         self = super().__new__(cls)
-        given = inspect.signature(cls.__init__).bind_partial(self, *args, **kwargs).arguments
         # A copy is made without arguments, and gets them with everything else.
-        self.__dict__["constructor_kwargs"] = dict(list(given.items())[1:])
+        self.__dict__["constructor_kwargs"] = named_arguments(cls, args, kwargs)
         return self

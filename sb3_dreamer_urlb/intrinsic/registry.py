@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-import inspect
 from typing import Any, TypeVar
 
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.method import ExplorationMethod
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
+from sb3_dreamer_urlb.signatures import named_parameters
 
 Method = TypeVar("Method", bound=ExplorationMethod)
 
@@ -78,13 +78,8 @@ def make_intrinsic_reward(
         raise ValueError(
             f"intrinsic_reward must be a name, a subclass or an instance of {kind.__name__}, or None, got {method!r}."
         )
-    # A class without a constructor of its own shows nn.Module's *args and **kwargs.
-    known = {
-        name
-        for name, one in inspect.signature(chosen).parameters.items()
-        if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
-    }
-    unknown = sorted(set(kwargs) - known)
+    known = named_parameters(chosen)
+    unknown = sorted(set(kwargs) - set(known))
     if unknown:
         raise ValueError(f"Unknown intrinsic_kwargs {unknown} for {method!r}; known are {sorted(known)}.")
     return _checked(chosen(**kwargs))

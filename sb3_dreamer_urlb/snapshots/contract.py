@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -11,6 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.signatures import named_parameters
 
 #: constructor arguments that are the loader's business
 NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
@@ -56,8 +56,9 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     @classmethod
     def argument_names(cls) -> list[str]:
         """The constructor arguments that files hold."""
-        return [name for name in inspect.signature(cls.__init__).parameters if name not in NOT_STORED]
+        return [name for name in named_parameters(cls) if name not in NOT_STORED]
 
     def arguments(self) -> dict[str, Any]:
-        """The constructor arguments, as the model has them now."""
-        return {name: getattr(self, ATTRIBUTES.get(name, name)) for name in self.argument_names()}
+        """The constructor arguments, as the model has them now; without those that a subclass keeps nowhere."""
+        attributes = {name: ATTRIBUTES.get(name, name) for name in self.argument_names()}
+        return {name: getattr(self, attribute) for name, attribute in attributes.items() if hasattr(self, attribute)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -11,6 +13,7 @@ import torch as th
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
 from sb3_dreamer_urlb.planning import Planner
+from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.random_state import capture
@@ -79,6 +82,8 @@ def describe(model: SavedAlgorithm, run: dict[str, Any] | None) -> dict[str, Any
 def describe_arguments(model: SavedAlgorithm) -> dict[str, Any]:
     """The constructor arguments of a model, as JSON."""
     arguments = model.arguments()
+    for name in sorted(set(model.argument_names()) - set(arguments)):
+        warnings.warn(f"{type(model).__name__} has no attribute {name!r}: its file leaves that argument out.")
     arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
     return {name: values.encode_or_describe(value) for name, value in arguments.items()}
 
@@ -128,9 +133,7 @@ def blank(
         )
     # The stored arguments are complete: the preset must not fill anything in.
     preset = decoded.pop("preset", "paper")
-    constructor: Any = algorithm
-    model: Model
-    model = constructor(policy, None, device=device, preset="paper", _init_setup_model=False, **decoded)
+    model = _constructed(algorithm, policy, {"device": device, "preset": "paper", **decoded})
     model.preset = preset
     return model
 
@@ -145,6 +148,21 @@ def _extended(name: str, stored: Any, given: Any) -> Any:
     if name.endswith("_kwargs") and isinstance(stored, dict) and isinstance(given, dict):
         return {**stored, **given}
     return given
+
+
+def _constructed(algorithm: type[Model], policy: Any, arguments: dict[str, Any]) -> Model:
+    """Without networks. An argument that a subclass fixes itself, and so hands on twice, is none of its own."""
+    constructor: Any = algorithm
+    arguments = {name: value for name, value in arguments.items() if name in named_parameters(algorithm)}
+    while True:
+        try:
+            model: Model = constructor(policy, None, _init_setup_model=False, **arguments)
+            return model
+        except TypeError as error:
+            twice = re.search(r"multiple values for (?:keyword )?argument '(\w+)'", str(error))
+            if twice is None or twice[1] not in arguments:
+                raise
+            del arguments[twice[1]]
 
 
 def _check_method(stored: dict[str, Any], given: dict[str, Any]) -> None:

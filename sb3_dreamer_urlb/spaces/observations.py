@@ -66,14 +66,18 @@ class Images(Observations):
         if not np.isfinite(np.float32(high) - np.float32(low)):
             raise UnsupportedSpaceError(f"Images need finite bounds, got {space}.")
         least, most = IMAGE_SIZES
-        if not is_image_space_channels_first(space):
+        # What SB3 did not transpose has its channels last; but uint8 images it did, unless VecTransposeImage(skip=True)
+        # said that they have them first, whatever their sizes look like.
+        if space.dtype != np.uint8 and not is_image_space_channels_first(space):
             raise UnsupportedSpaceError(
                 f"Images must have their channels first (SB3 transposes an environment's uint8 images only), got {space}. "
                 "Let the environment put the channels first, or return uint8 in [0, 255]."
             )
         channels, height, width = space.shape
         if not (least <= height <= most and least <= width <= most):
-            raise UnsupportedSpaceError(f"Images must be {least} to {most} pixels high and wide, got {height}×{width}.")
+            raise UnsupportedSpaceError(
+                f"Images must be {least} to {most} pixels high and wide, channels first, got {height}×{width} in {space}."
+            )
         self.shape = (channels, height, width)
         self.low, self.range = low, high - low
         self.dtype = th.uint8 if space.dtype == np.uint8 else None

@@ -58,20 +58,22 @@ class ConvEncoder(Encoder):
 
 
 class VectorEncoder(MLP, Encoder):
-    """ELU layers; the last one's output is the embedding.
+    """ELU layers; the last one's output is the embedding. Without layers, that is the vector itself.
 
     :param size: of the vector
     :param net_arch: widths of the layers
     """
 
     def __init__(self, size: int, net_arch: Sequence[int]):
-        super().__init__(size, net_arch[:-1], net_arch[-1])
+        super().__init__(size, net_arch[:-1], net_arch[-1] if net_arch else size)
         self.scalar = False
-        self.embed_size = net_arch[-1]
+        self.embed_size = net_arch[-1] if net_arch else size
+        if not net_arch:
+            self.out = nn.Identity()  # type: ignore[assignment]
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """(…, size) → (…, E)."""
-        return elu_(super().forward(x))
+        return x if isinstance(self.out, nn.Identity) else elu_(super().forward(x))
 
 
 class DictEncoder(Encoder):

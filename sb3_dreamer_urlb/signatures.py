@@ -1,0 +1,39 @@
+"""The arguments that a class takes, also through constructors that hand ``*args`` and ``**kwargs`` on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+NAMELESS = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+
+
+def named_parameters(kind: type) -> dict[str, inspect.Parameter]:
+    """Of a constructor, by name and without ``self``; ``**kwargs`` stand for what the next constructor up takes.
+
+    :param kind: the class
+    """
+    found: dict[str, inspect.Parameter] = {}
+    for base in kind.__mro__:
+        if "__init__" not in vars(base) or base is object:
+            continue
+        _, *parameters = inspect.signature(base.__init__).parameters.values()  # type: ignore[misc]
+        for parameter in parameters:
+            if parameter.kind not in NAMELESS:
+                found.setdefault(parameter.name, parameter)
+        if not any(parameter.kind == inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return found
+
+
+def named_arguments(kind: type, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a call by their names, as far as they have any.
+
+    :param kind: the class that is called
+    :param args: without names
+    :param kwargs: by name
+    """
+    names = [name for name, parameter in named_parameters(kind).items() if parameter.kind in POSITIONAL]
+    return {**dict(zip(names, args, strict=False)), **kwargs}
