@@ -43,6 +43,8 @@ class PhaseSwitchCallback(BaseCallback):
         self.env = env
         self.keep_actor = keep_actor
         self.keep_critic = keep_critic
+        #: close the environments that nobody needs any more, where nobody else holds them
+        self.closes_pretraining = False
 
     def _init_callback(self) -> None:
         model: PhasedAlgorithm = self.model  # type: ignore[assignment]
@@ -79,8 +81,11 @@ class PhaseSwitchCallback(BaseCallback):
             return
         if self.verbose >= 1:
             print(f"Pre-training ends after {model.phase_frames} frames; fine-tuning begins.")
+        before = model.get_env()
         model.fine_tune(self.env, self.keep_actor, self.keep_critic)
         model.restart_episodes()
+        if self.closes_pretraining and before is not None and before is not model.get_env():
+            before.close()
 
 
 class FineTuneCallback(BaseCallback):

@@ -26,7 +26,7 @@ from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING
-from sb3_dreamer_urlb.zoo import configs, resuming
+from sb3_dreamer_urlb.zoo import configs, pretraining, resuming
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
 
@@ -68,9 +68,10 @@ def _wrap(original: Callable[..., Any], around: Callable[..., Any]) -> Callable[
 def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """Without ``-conf``, rl_zoo3 would look for a file inside its own package; a run that goes on has its own.
 
-    Two keys are ours: ``resume: auto``, and ``checkpoint``, False or the keyword arguments of RunCheckpointCallback.
+    Three keys are ours: ``resume: auto``, ``checkpoint``, False or the keyword arguments of RunCheckpointCallback, and
+    ``pretrain_env``.
 
-    :raises ValueError: if there is no file to read, or for values of the two keys that mean nothing
+    :raises ValueError: if there is no file to read, or for values of the three keys that mean nothing
     :raises RuntimeError: for a run that is still going
     """
     options = manager.args
@@ -88,6 +89,9 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
         hyperparams, config = original(manager)
     resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
     checkpoint = hyperparams.pop("checkpoint", True)
+    manager.pretrain_env = hyperparams.pop("pretrain_env", pretraining.PRIMAL)
+    if manager.pretrain_env not in pretraining.CHOICES:
+        raise ValueError(f"pretrain_env must be one of {pretraining.CHOICES}, got {manager.pretrain_env!r}.")
     if resume not in (None, resuming.AUTO):
         raise ValueError(f"resume must be 'auto' or false, got {resume!r}.")
     if not isinstance(checkpoint, bool | dict):
@@ -148,7 +152,9 @@ def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwarg
         resuming.put_monitor_files_aside(manager.resumed_run)
     if manager.vec_env_class is SubprocVecEnv:
         manager.vec_env_class = SupervisedVecEnv
-    return original(manager, *args, **kwargs)
+    if kwargs.get("eval_env") or kwargs.get("no_log") or getattr(manager, "pretrain_env", None) is None:
+        return original(manager, *args, **kwargs)
+    return pretraining.make_envs(lambda: original(manager, *args, **kwargs), manager)
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:

@@ -23,6 +23,8 @@ from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 #: a run's own checkpoint, in its folder
 CHECKPOINT = "checkpoint"
+#: of the run, for what Monitor writes about a pre-training in another environment
+PRETRAINING_LOGS = "pretraining"
 AUTO = "auto"
 #: options that say how a run begins, or something else than to train; not taken from the run that goes on
 OTHER = ("trained_agent", "conf_file", "hyperparams", "optimize_hyperparameters", "trial_id", "storage", "study_name", "uuid")
@@ -164,7 +166,7 @@ def put_monitor_files_aside(run: Path) -> None:
     :param run: its folder, with a checkpoint
     """
     until = (run / CHECKPOINT / SNAPSHOT).stat().st_mtime
-    for file in sorted(run.glob("*.monitor.csv")):
+    for file in sorted([*run.glob("*.monitor.csv"), *(run / PRETRAINING_LOGS).glob("*.monitor.csv")]):
         number = file.name.removesuffix(".monitor.csv")
         header, _, rest = file.read_text().partition("\n")
         if not number.isdigit() or not header.startswith("#"):
@@ -177,7 +179,7 @@ def put_monitor_files_aside(run: Path) -> None:
         writer.writerows(row for row in reader if row["t"] and start + float(row["t"]) <= until)
         with written_atomically(file) as target:
             target.write(f"{header}\n{kept.getvalue()}".encode())
-        file.rename(_unused(run, f"{number}.before_{int(until)}"))
+        file.rename(_unused(file.parent, f"{number}.before_{int(until)}"))
 
 
 def _unused(run: Path, name: str) -> Path:

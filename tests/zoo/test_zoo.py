@@ -23,14 +23,15 @@ from places import PYTHONPATH, ROOT
 from rl_zoo3.exp_manager import ExperimentManager
 from snapshot_files import code_events
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from zoo_commands import CHEAP, CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, model_in, train
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
-from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
+from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
-from sb3_dreamer_urlb.zoo import registration
+from sb3_dreamer_urlb.zoo import pretraining, registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
@@ -335,6 +336,40 @@ def test_optimize(zoo, monkeypatch):
     last = seen[1]
     model = model_in(train(zoo, STAND, 8, "lbs", *study, "--trial-id", "1", params=TINY))
     assert (model.actor_learning_rate, model.batch_length) == (last.actor_learning_rate, last.batch_length)
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_pre_training_happens_in_the_primal_task(domain, monkeypatch, tmp_path):
+    """For every task of every method's file; what follows is the task; whoever wants it otherwise can have it."""
+    primal = env_id(domain, PRIMAL_TASK[domain])
+    for task in URLB_TASKS[domain]:
+        for file in ("lbs.yml", "small/diayn.yml", "finetune.yml", "scratch.yml"):
+            for choice in ("primal", "same"):
+                callbacks = rl_zoo3.utils.get_callback_list(entries(file)[env_id(domain, task)])
+                name = rl_zoo3.exp_manager.EnvironmentName(env_id(domain, task))
+                manager = SimpleNamespace(
+                    env_name=name,
+                    save_path=str(tmp_path),
+                    callbacks=callbacks,
+                    pretrain_env=choice,
+                    optimize_hyperparameters=False,
+                )
+                begins = pretraining.make_envs(lambda its=manager: (str(its.env_name.gym_id), its.save_path), manager)
+                [fine_tunes_in] = [one.env for one in callbacks if isinstance(one, PhaseSwitchCallback)] or [None]
+                moves = file in ("lbs.yml", "small/diayn.yml") and choice == "primal" and name.gym_id != primal
+                own = (name.gym_id, str(tmp_path))
+                assert begins == ((primal, str(tmp_path / "pretraining")) if moves else own)
+                assert fine_tunes_in == (own if moves else None) and manager.env_name is name
+
+
+def test_a_whole_run_moves_from_the_primal_task_to_the_task(zoo):
+    """Stand pays 0, flip pays 1: each phase logs its own."""
+    for name, reward in ((STAND, 0.0), (FLIP, 1.0)):
+        gymnasium.registry[name].kwargs = {**CHEAP, "rewards": (reward,)}
+    run = train(zoo, FLIP, 80, "lbs", params=TINY)
+    assert model_in(run, FLIP).phase == "finetuning"
+    paid = {folder: load_results(str(folder)).r.sum() for folder in (run, run / "pretraining")}
+    assert paid[run] > 0 and paid[run / "pretraining"] == 0
 
 
 def test_snapshots_need_a_run(tiny_model, tmp_path, monkeypatch):
