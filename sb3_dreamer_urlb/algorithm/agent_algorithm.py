@@ -126,10 +126,10 @@ class AgentAlgorithm(PhasedAlgorithm):
         self.policy.set_training_mode(True)
         self._set_learning_rates()
         for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            batch = self.replay_buffer.sample(batch_size, env=self._drawn_through())
             self._metrics.add(self.learner.update(batch))
             # While the device works on the update, and until the next one.
-            self.replay_buffer.prefetch(batch_size, self._vec_normalize_env)
+            self.replay_buffer.prefetch(batch_size, self._drawn_through())
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
         self.learner.guard.stop_if_repeated(self.num_timesteps)

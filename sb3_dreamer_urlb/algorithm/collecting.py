@@ -19,6 +19,7 @@ from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
+from sb3_dreamer_urlb.envs.normalized import RewardsOnly, hides_originals
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.spaces.actions import make_actions
 
@@ -35,6 +36,8 @@ class CollectingAlgorithm(SavingAlgorithm):
     env_faults: int
     #: see ``last_touches``; as of when the model itself last reset or stepped its environments
     _touches: tuple[int, ...] = ()
+    #: see :meth:`_drawn_through`
+    _rewards_only: RewardsOnly | None = None
 
     def _warms_up_randomly(self) -> bool:
         """Whether the steps before this phase's first update act uniformly at random, not with the actor."""
@@ -170,13 +173,14 @@ class CollectingAlgorithm(SavingAlgorithm):
         if normalizer is None:
             self._last_original_obs, original_obs = self._last_obs, new_obs
         else:
-            original_obs, reward = self._original_obs(normalizer), normalizer.get_original_reward()
+            original_obs, reward = self._original_obs(new_obs), normalizer.get_original_reward()
+        undoes = normalizer is not None and not self._keeps_what_was_seen()
         self.env_faults += env_steps.count_faults(infos)
         # The VecEnv has already begun the next episode: put the true last observation back.
         next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
             if (last := infos[i].get("terminal_observation")) is not None:
-                _put(next_obs, int(i), last if normalizer is None else normalizer.unnormalize_obs(last))
+                _put(next_obs, int(i), normalizer.unnormalize_obs(last) if normalizer is not None and undoes else last)
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
@@ -201,11 +205,29 @@ class CollectingAlgorithm(SavingAlgorithm):
         # Environments may write the next observation into the same arrays.
         self._last_obs = copy.deepcopy(self._last_obs)
         if self._vec_normalize_env is not None:
-            self._last_original_obs = self._original_obs(self._vec_normalize_env)
+            self._last_original_obs = self._original_obs(self._last_obs)
 
-    def _original_obs(self, normalizer: VecNormalize) -> np.ndarray | dict[str, np.ndarray]:
-        """The last observation before normalisation, with channels first as the model sees it."""
-        original = normalizer.get_original_obs()
+    def _keeps_what_was_seen(self) -> bool:
+        """Whether the replay holds normalised observations, because a wrapper outside of VecNormalize changed them further."""
+        assert self.env is not None
+        return self._vec_normalize_env is not None and hides_originals(self.env, self._vec_normalize_env)
+
+    def _drawn_through(self) -> VecNormalize | None:
+        """What normalises the rows that the replay draws."""
+        if not self._keeps_what_was_seen():
+            return self._vec_normalize_env
+        if getattr(self._rewards_only, "normalizer", None) is not self._vec_normalize_env:
+            self._rewards_only = RewardsOnly(self._vec_normalize_env)  # type: ignore[arg-type]
+        return self._rewards_only  # type: ignore[return-value]
+
+    def _original_obs(self, seen: Any) -> Any:
+        """The last observation before normalisation, with channels first as the model sees it.
+
+        :param seen: after it
+        """
+        if self._vec_normalize_env is None or self._keeps_what_was_seen():
+            return seen
+        original = self._vec_normalize_env.get_original_obs()
         return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
 
 

@@ -368,7 +368,7 @@ class DreamerV2(AgentAlgorithm):
         if not isinstance(agent.intrinsic, SkillReward) or agent.explores:
             return
         sequences = -(-max(transfer.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
-        batch = self.replay_buffer.sample(sequences, env=self._vec_normalize_env)
+        batch = self.replay_buffer.sample(sequences, env=self._drawn_through())
         model = agent.world_model
         with th.no_grad():
             posterior = model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, register_intrinsic_reward
 from sb3_dreamer_urlb.dreamer_v2.policies import MlpPolicy
@@ -223,6 +226,36 @@ def test_images_that_only_look_as_if_channels_were_last(shape, frames):
     assert model.observation_space.shape == before[1:] and model._last_obs.shape == before and model._n_updates > 0
     action, _ = model.predict(env.reset())
     assert action.shape == (1, *model.action_space.shape)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("frames", [2, 3])
+@pytest.mark.parametrize("seen", [VECTOR, spaces.Dict(a=VECTOR)], ids=str)
+def test_frames_that_are_stacked_outside_of_vec_normalize(n_envs, frames, seen):
+    """rl_zoo3's order: the replay holds what the agent saw, rewards are the environment's; terminal rows included."""
+    names = list(seen.spaces) if isinstance(seen, spaces.Dict) else [None]
+    makers = [lambda: CounterEnv(5, observation_space=seen, rewards=(3.0,))] * n_envs
+    env = VecFrameStack(VecNormalize(DummyVecEnv(makers)), frames)
+    policy = "MlpPolicy" if names == [None] else "MultiInputPolicy"
+    model = DreamerV2(policy, env, preset="tiny", seed=0, replay_buffer_kwargs={"sampling": "rows"})
+    given = [env.reset()]
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            given.append(copy.deepcopy(self.locals["new_obs"]))
+            return True
+
+    model.learn(40, callback=Watch())
+    assert model._n_updates > 0
+    for episode in model.replay_buffer.episodes:
+        assert set(episode.reward[1:].tolist()) == {3.0}
+        for name in names:
+            rows = episode.observation if name is None else episode.observation[name]
+            assert rows.shape[1:] == (3 * frames,) and np.abs(rows).max() <= 10.0
+            # Frames move on by one from row to row, also to the last one.
+            assert np.allclose(rows[1:, : 3 * (frames - 1)], rows[:-1, 3:])
+    batch = model.replay_buffer.sample(2, env=model._drawn_through())
+    assert np.allclose(batch.reward[batch.reward != 0].numpy(), model.get_vec_normalize_env().normalize_reward(3.0), atol=1e-5)
 
 
 # -- time limits -----------------------------------------------------------------------------------------------------------
