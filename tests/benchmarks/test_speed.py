@@ -14,6 +14,7 @@ from operator_calls import SYNCHRONISING, Calls
 
 from sb3_dreamer_urlb import native
 from sb3_dreamer_urlb.native import product_ops
+from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 from sb3_dreamer_urlb.planning import DynaMPC, PlannerConfig
 from sb3_dreamer_urlb.planning.prepared.agent import planned
 
@@ -31,6 +32,8 @@ BOUNDS = {
     ("plan", None, "float32", "native"): 355,
     ("plan", None, "bfloat16", "native"): 380,
 }
+#: operator calls of a plan whose bfloat16 products are float32 ones, where the processor has no others
+CONVERSIONS = 130
 PLANNER = PlannerConfig(horizon=3, n_samples=8, iterations=2, top_k=4, mixture=0.25)
 
 
@@ -66,7 +69,10 @@ def test_operator_calls_stay_below_their_bound(work, case, request):
         run()
     total = calls.counts.total()
     most = calls.counts.most_common(15)
-    assert total <= BOUNDS[case], f"{case}: {total} operator calls, the bound is {BOUNDS[case]}: {most}"
+    bound = BOUNDS[case]
+    if case[0] == "plan" and case[2] == "bfloat16" and not cpu_multiplies_short():
+        bound += CONVERSIONS
+    assert total <= bound, f"{case}: {total} operator calls, the bound is {bound}: {most}"
     # A bound that nothing comes near guards nothing.
     assert total > 0.8 * BOUNDS[case], f"{case}: only {total} operator calls, lower the bound of {BOUNDS[case]}"
 
