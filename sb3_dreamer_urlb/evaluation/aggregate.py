@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.evaluation.names import TASKS
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M, normalized_score
 
-MISSING_RLIABLE = "Interquartile means and intervals need rliable: pip install 'sb3_dreamer_urlb[plots]'."
+MISSING_RLIABLE = "Interquartile means and intervals need rliable: pip install '.[plots]'."
 #: of a run's budget of frames: so near is at its end (the last evaluation may come a few steps late or early)
 NEAR = 0.05
 REPETITIONS, SIZE = 2000, 0.95

@@ -64,7 +64,7 @@ def render(template: str, **values: Any) -> str:
     try:
         import jinja2
     except ImportError as error:
-        raise ImportError("Pages need jinja2: pip install 'sb3_dreamer_urlb[plots]'.") from error
+        raise ImportError("Pages need jinja2: pip install '.[plots]'.") from error
     loader = jinja2.FileSystemLoader(TEMPLATES)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     return environment.get_template(template).render(**values)

@@ -50,7 +50,7 @@ def check_matplotlib_installed() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ImportError("Figures need matplotlib: pip install 'sb3_dreamer_urlb[plots]'.") from error
+        raise ImportError("Figures need matplotlib: pip install '.[plots]'.") from error
 
 
 @dataclass
