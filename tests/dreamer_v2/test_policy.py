@@ -10,9 +10,9 @@ import pytest
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from operator_calls import SYNCHRONISING
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
-from test_behavior import SYNCHRONISING
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2
 

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from test_envs_rendering import run
+from without_display import run
 
 from sb3_dreamer_urlb.envs import (
     Perturbations,

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
-from test_envs_rendering import run
+from without_display import run
 
 from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, env_id, make_control_env, make_dmc_env, make_urlb_env, options
 

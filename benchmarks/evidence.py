@@ -1,0 +1,324 @@
+"""Does pre-training pay? All runs that answer it on CPU cores: does what is missing, scores it, prints the table.
+
+    python benchmarks/evidence.py run --minutes 120   # the next missing runs, one after the other, on one thread
+    python benchmarks/evidence.py table               # what the finished ones say, with intervals
+    python benchmarks/evidence.py list                # what there is and what is missing
+
+An agent that sees states (``observation="state"``) pre-trains on walker stand without its reward, then learns another task;
+beside it agents that learn that task from scratch. Everything lies in ``results/evidence``: ``episodes.csv``, a row for every
+episode of every finished run; ``rows.csv``, a row for every score (actor alone, and with Dyna-MPC); ``snapshots/``, the
+pre-trained agents, from which further fine-tunings start. Runs that are under way keep themselves in ``runs/`` and go on there
+when they are asked for again; several processes, each with its own run, may work beside each other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import fcntl
+import itertools
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback, __version__
+from sb3_dreamer_urlb.evaluation.append import append_rows
+from sb3_dreamer_urlb.evaluation.rows import Row
+
+ROOT = Path(__file__).parents[1] / "results" / "evidence"
+PRESET, PRIMAL = "state-small", "stand"
+#: agent steps; an episode has 500
+PRETRAINING, FINETUNING, REPEAT = 20_000, 10_000, 2
+#: name of an arm → intrinsic reward of its pre-training (None: from scratch), and whether the actor is kept
+ARMS: dict[str, tuple[str | None, bool]] = {
+    "scratch": (None, False),
+    "lbs-kept": ("lbs", True),
+    "lbs-fresh": ("lbs", False),
+    "random-fresh": ("random", False),
+    "plan2explore-kept": ("plan2explore", True),
+}
+#: what to run, most telling first: arms, tasks, number of seeds
+STUDY: tuple[tuple[tuple[str, ...], tuple[str, ...], int], ...] = (
+    (("lbs-kept", "scratch"), ("run", "flip"), 10),
+    (("random-fresh", "lbs-fresh"), ("run", "flip"), 10),
+    (("plan2explore-kept",), ("run", "flip"), 10),
+)
+#: of the evaluation at a run's end
+EPISODES, EVALUATION_SEED = 10, 10_000
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    :param arm: of ``ARMS``
+    :param task: of the walker; ``""`` for the pre-training itself
+    :param seed: of everything
+    """
+
+    arm: str
+    task: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder, and in ``episodes.csv``."""
+        return f"{self.task}/{self.arm}/{self.seed}" if self.task else f"pretraining/{self.arm}/{self.seed}"
+
+    @property
+    def needs(self) -> Run | None:
+        """The pre-training that it starts from."""
+        method, _ = ARMS.get(self.arm, (None, False))
+        return Run(method, "", self.seed) if self.task and method is not None else None
+
+
+def wanted() -> Iterator[Run]:
+    """All runs in order, each after the pre-training that it needs."""
+    seen = set()
+    for arms, tasks, seeds in STUDY:
+        for seed, task, arm in itertools.product(range(seeds), tasks, arms):
+            run = Run(arm, task, seed)
+            for one in (run.needs, run):
+                if one is not None and one not in seen:
+                    seen.add(one)
+                    yield one
+
+
+# -- one run ---------------------------------------------------------------------------------------------------------------
+
+
+def make_env(task: str, seed: int, statistics: Path | None = None, training: bool = True) -> VecNormalize:
+    """Walker states, normalised: with the statistics of the pre-training where there was one."""
+    env = DummyVecEnv([lambda: Monitor(gymnasium.make(f"urlb/walker-{task}-v0", observation="state"))])
+    env.seed(seed)
+    normalized = VecNormalize(env, norm_reward=False, training=training)
+    if statistics is not None:
+        with np.load(statistics) as file:
+            rms = normalized.obs_rms
+            rms.mean, rms.var, rms.count = file["mean"], file["var"], float(file["count"])
+    return normalized
+
+
+def save_statistics(env: VecNormalize, path: Path) -> None:
+    """Without pickles."""
+    np.savez(path, mean=env.obs_rms.mean, var=env.obs_rms.var, count=env.obs_rms.count)
+
+
+class Episodes(BaseCallback):
+    """Writes agent step and return of every episode into a file; what a resumed run does again counts once."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path = path
+
+    def rows(self) -> list[tuple[int, float]]:
+        """All that is known."""
+        if not self.path.exists():
+            return []
+        lines = (line.split(",") for line in self.path.read_text().splitlines())
+        return sorted({int(step): float(score) for step, score in lines}.items())
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                with open(self.path, "a") as file:
+                    file.write(f"{self.model.phase_timesteps},{info['episode']['r']:.3f}\n")  # type: ignore[union-attr]
+        return True
+
+
+def snapshot_of(pretraining: Run) -> Path:
+    """Where a pre-trained agent lies; its statistics beside it, ``.npz``."""
+    return ROOT / "snapshots" / f"{pretraining.arm}-{pretraining.seed}.zip"
+
+
+def begin(run: Run, folder: Path) -> tuple[DreamerV2, int]:
+    """A model at the beginning of its run, or where the run was left, and how many agent steps it has in all."""
+    method, keep_actor = (run.arm, False) if not run.task else ARMS[run.arm]
+    source = None if run.needs is None else snapshot_of(run.needs)
+    start = None if source is None else source.with_suffix(".npz")
+    env = make_env(run.task or PRIMAL, run.seed if not run.task else 1000 + run.seed, start)
+    left = DreamerV2.resume(folder, env, device="cpu")
+    if left is not None:
+        return left, FINETUNING if run.task else PRETRAINING
+    if source is not None:
+        model = DreamerV2.load(source, env=env, device="cpu")
+        model.fine_tune(keep_actor=keep_actor)
+        model.num_timesteps = 0
+        return model, FINETUNING
+    model = DreamerV2("MlpPolicy", env, preset=PRESET, intrinsic_reward=method, seed=run.seed, device="cpu")
+    return model, FINETUNING if run.task else PRETRAINING
+
+
+def do(run: Run) -> None:
+    """From wherever it was left to its end and into the results."""
+    folder = ROOT / "runs" / run.name
+    folder.mkdir(parents=True, exist_ok=True)
+    model, steps = begin(run, folder)
+    episodes = Episodes(folder / "episodes.csv")
+    began = time.monotonic()
+    keeper = RunCheckpointCallback(folder, every_frames=2 * 2500)
+    model.learn(steps - model.num_timesteps, callback=[keeper, episodes], reset_num_timesteps=model.num_timesteps == 0)
+    env = model.get_vec_normalize_env()
+    assert env is not None
+    if run.task:
+        score(run, model, env, folder)
+    else:
+        for optimizer in model.learner.optimizers().values():
+            # Fine-tuning starts with fresh ones, and they are two thirds of a file.
+            optimizer.adam.state.clear()
+        path = snapshot_of(run)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_statistics(env, path.with_suffix(".npz"))
+        model.save(path)
+    record(run, episodes.rows())
+    shutil.rmtree(folder)
+    print(f"{run.name}: done, {time.monotonic() - began:.0f} s", flush=True)
+
+
+def record(run: Run, episodes: list[tuple[int, float]]) -> None:
+    """Append a finished run's episodes to the results."""
+    with locked(), open(ROOT / "episodes.csv", "a", newline="") as file:
+        writer = csv.writer(file)
+        if file.tell() == 0:
+            writer.writerow(["run", "step", "return"])
+        writer.writerows((run.name, step, f"{score:.3f}") for step, score in episodes)
+
+
+def score(run: Run, model: DreamerV2, env: VecNormalize, folder: Path) -> None:
+    """Ten episodes with the actor alone and ten with Dyna-MPC, as rows."""
+    save_statistics(env, folder / "statistics.npz")
+    model.save(folder / "final.zip")
+    method, keep_actor = ARMS[run.arm]
+    rows = []
+    for planner in (None, "dyna_mpc"):
+        unseen = make_env(run.task, EVALUATION_SEED + run.seed, folder / "statistics.npz", training=False)
+        agent = DreamerV2.load(folder / "final.zip", env=unseen, device="cpu", planner=planner)
+        began = time.monotonic()
+        returns, _ = evaluate_policy(agent, unseen, EPISODES, return_episode_rewards=True)
+        rows.append(
+            Row(
+                method=method or "dreamer",
+                domain="walker",
+                task=run.task,
+                seed=run.seed,
+                pretrain_frames=0 if method is None else PRETRAINING * REPEAT,
+                finetune_frames=FINETUNING * REPEAT,
+                keep_actor=None if method is None else keep_actor,
+                keep_critic=None if method is None else False,
+                planner=planner or "none",
+                preset=PRESET,
+                return_mean=float(np.mean(returns)),
+                return_std=float(np.std(returns)),
+                episodes=EPISODES,
+                seconds=time.monotonic() - began,
+                further={"observation": "state", "arm": run.arm, "algorithm_version": __version__},
+            )
+        )
+    append_rows(ROOT / "rows.csv", rows)
+
+
+# -- the campaign ------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def locked(name: str = "lock", wait: bool = True) -> Iterator[bool]:
+    """Whether this process has it now."""
+    path = ROOT / "runs" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+
+
+def curves() -> dict[str, list[tuple[int, float]]]:
+    """Episodes of the finished runs, by name."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    path = ROOT / "episodes.csv"
+    if path.exists():
+        with open(path, newline="") as file:
+            for row in csv.DictReader(file):
+                found.setdefault(row["run"], []).append((int(row["step"]), float(row["return"])))
+    return found
+
+
+def work(minutes: float, at_most: int | None) -> None:
+    """Do missing runs until the time is up; one that is under way then is stopped and kept by a signal, or a kill."""
+    end, count = time.monotonic() + 60 * minutes, 0
+    for run in wanted():
+        if time.monotonic() > end or count == at_most:
+            return
+        if run.name in curves() or (run.needs is not None and run.needs.name not in curves()):
+            continue
+        with locked(run.name.replace("/", "-") + ".lock", wait=False) as mine:
+            if mine and run.name not in curves():
+                do(run)
+                count += 1
+
+
+def measures(episodes: list[tuple[int, float]]) -> dict[str, float]:
+    """What a run is compared by: mean return over all of fine-tuning (area under its curve), and over its last quarter."""
+    scores = np.array([value for _, value in sorted(episodes)])
+    return {"whole": float(scores.mean()), "last quarter": float(scores[-max(len(scores) // 4, 1) :].mean())}
+
+
+def table() -> str:
+    """Interquartile mean over seeds with a 95 % stratified-bootstrap interval, for every task and arm."""
+    from rliable import library, metrics
+
+    found = curves()
+    lines = ["| task | arm | seeds | mean return, whole | mean return, last quarter |", "|---|---|---|---|---|"]
+    for task in sorted({task for _, tasks, _ in STUDY for task in tasks}, reverse=True):
+        for arm in ARMS:
+            runs = [measures(value) for name, value in found.items() if name.startswith(f"{task}/{arm}/")]
+            if len(runs) < 2:
+                continue
+            cells = []
+            for measure in ("whole", "last quarter"):
+                scores = {arm: np.array([[run[measure]] for run in runs])}
+                state = np.random.RandomState(0)
+                point, interval = library.get_interval_estimates(
+                    scores, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=20_000, random_state=state
+                )
+                cells.append(f"{point[arm][0]:.0f} [{interval[arm][0, 0]:.0f}, {interval[arm][1, 0]:.0f}]")
+            lines.append(f"| {task} | {arm} | {len(runs)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    run = commands.add_parser("run", help="do missing runs")
+    run.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
+    run.add_argument("--at-most", type=int, help="runs")
+    commands.add_parser("list", help="all runs, and which are done")
+    commands.add_parser("table", help="of the finished runs (rliable)")
+    options: Any = parser.parse_args()
+    th.set_num_threads(1)
+    if options.command == "run":
+        work(options.minutes, options.at_most)
+    elif options.command == "list":
+        done = curves()
+        for one in wanted():
+            print("done   " if one.name in done else "missing", one.name)
+    else:
+        print(table())
+
+
+if __name__ == "__main__":
+    main()
