@@ -12,6 +12,7 @@ from torch import nn
 from sb3_dreamer_urlb.behavior.actor_critic import Actor, CategoricalActor, Critic, RewardNormalizer, SuccessorCritic
 from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.skills import Skills
+from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.types import LatentState
 from sb3_dreamer_urlb.world_model.world_model import WorldModel
 
@@ -24,6 +25,8 @@ class Agent(nn.Module):
     :param intrinsic: what it explores with, not yet built; None for an agent without skills that learns a task
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     :param classes: number of classes of each choice that is an action; empty where actions are numbers
+    :param task_reward: while exploring with a reward that the reward head learns, learn the task's beside it (paper, appendix
+        "Learning Rewards Online")
     """
 
     def __init__(
@@ -33,6 +36,7 @@ class Agent(nn.Module):
         intrinsic: IntrinsicReward | None,
         explores: bool = True,
         classes: Sequence[int] = (),
+        task_reward: bool = False,
     ):
         super().__init__()
         sizes = world_model.sizes
@@ -51,11 +55,23 @@ class Agent(nn.Module):
         self.critic = critic_class(sizes.feature, net_arch, skill_size)
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.reward_normalizer = RewardNormalizer(intrinsic.momentum if self.explores and intrinsic is not None else 1.0)
+        self.task_reward: MLP | None = None
+        if task_reward and self.explores and intrinsic is not None and intrinsic.labels_replay:
+            # Everything else begins as it does without this head.
+            with th.random.fork_rng(devices=[]):
+                self.task_reward = MLP(sizes.feature, net_arch)
 
     @property
     def skills(self) -> Skills | None:
         """What actor and critic are conditioned on, None for a method without skills."""
         return None if self.intrinsic is None else self.intrinsic.skills
+
+    def known_reward(self) -> MLP | None:
+        """The head that has learnt the task's reward; None if the only one learns the intrinsic reward."""
+        if self.task_reward is not None:
+            return self.task_reward
+        taken = self.explores and self.intrinsic is not None and self.intrinsic.labels_replay
+        return None if taken else self.world_model.reward
 
     def acts_randomly(self) -> bool:
         """Whether exploration is nothing but uniformly random actions."""

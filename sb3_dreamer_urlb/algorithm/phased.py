@@ -205,7 +205,13 @@ class PhasedAlgorithm(CollectingAlgorithm):
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    def fine_tune(self, env: GymEnv | None = None, keep_actor: bool | None = None, keep_critic: bool = False) -> None:
+    def fine_tune(
+        self,
+        env: GymEnv | None = None,
+        keep_actor: bool | None = None,
+        keep_critic: bool = False,
+        keep_reward: bool = False,
+    ) -> None:
         """Leave pre-training: what the transfer keeps stays, everything else starts afresh (paper §3).
 
         The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
@@ -213,13 +219,17 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :param env: the fine-tuning environment; None stays in the same one
         :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
         :param keep_critic: for ablations
-        :raises ValueError: if the model is not pre-training
+        :param keep_reward: begin with the task's reward head as the pre-training's rewards taught it (paper, appendix
+            "Learning Rewards Online"); it is that of the *pre-training* environment's task
+        :raises ValueError: if the model is not pre-training, or there is no such head
         """
         if self.phase != phases.PRETRAINING:
             raise ValueError(
                 f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}: "
                 "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
             )
+        if keep_reward:
+            self._check_reward_is_known()
         if env is not None:
             before, env = self._vec_normalize_env, self.prepare_fine_tuning_env(env)
             self.set_env(env)
@@ -232,7 +242,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         self.replay_buffer.close()
         del self.replay_buffer
         self._build()
-        self._transfer(pretrained, keep_actor, keep_critic)
+        self._transfer(pretrained, keep_actor, keep_critic, keep_reward)
         self._last_obs = None
 
     def _keeps_actor(self) -> bool:
@@ -250,13 +260,20 @@ class PhasedAlgorithm(CollectingAlgorithm):
             normalized.check(self._vec_normalize_env, unwrap_vec_normalize(wrapped))
         return wrapped
 
+    def _check_reward_is_known(self) -> None:
+        """
+        :raises ValueError: if the pre-training has learnt no reward head of the task
+        """
+        raise ValueError(f"keep_reward=True needs a reward head, and {type(self).__name__} has none.")
+
     @abstractmethod
-    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:
+    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         """Take over from the pre-trained policy what fine-tuning keeps; the model's own is fresh.
 
         :param pretrained: of the same sizes
         :param keep_actor: whether the actor is kept
         :param keep_critic: whether the critic is kept
+        :param keep_reward: whether the task's reward head is kept
         """
 
     # -- learning ------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ class PhaseSwitchCallback(BaseCallback):
     :param env: the fine-tuning environment; None stays in the same one
     :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
     :param keep_critic: for ablations
+    :param keep_reward: begin with the task's reward head of the pre-training, see ``fine_tune``
     :param verbose: 1 prints the switch
     :raises ValueError: for a number of frames that is not positive, and, when ``learn`` begins, for an ``env`` that does
         not fit the model
@@ -35,6 +36,7 @@ class PhaseSwitchCallback(BaseCallback):
         keep_actor: bool | None = None,
         keep_critic: bool = False,
         verbose: int = 0,
+        keep_reward: bool = False,
     ):
         super().__init__(verbose)
         if not is_integer(pretrain_frames) or pretrain_frames < 1:
@@ -43,6 +45,7 @@ class PhaseSwitchCallback(BaseCallback):
         self.env = env
         self.keep_actor = keep_actor
         self.keep_critic = keep_critic
+        self.keep_reward = keep_reward
         #: close the environments that nobody needs any more, where nobody else holds them
         self.closes_pretraining = False
 
@@ -52,6 +55,8 @@ class PhaseSwitchCallback(BaseCallback):
             warnings.warn(
                 "PhaseSwitchCallback has nothing to switch: with intrinsic_reward=None the model learns the task at once."
             )
+        if self.keep_reward and model.phase == PRETRAINING:
+            model._check_reward_is_known()
         if self.env is None:
             return
         # Now, not after the 2M frames of pre-training.
@@ -82,7 +87,7 @@ class PhaseSwitchCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"Pre-training ends after {model.phase_frames} frames; fine-tuning begins.")
         before = model.get_env()
-        model.fine_tune(self.env, self.keep_actor, self.keep_critic)
+        model.fine_tune(self.env, self.keep_actor, self.keep_critic, self.keep_reward)
         model.restart_episodes()
         if self.closes_pretraining and before is not None and before is not model.get_env():
             before.close()
@@ -95,14 +100,16 @@ class FineTuneCallback(BaseCallback):
 
     :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
     :param keep_critic: for ablations
+    :param keep_reward: begin with the task's reward head of the pre-training, see ``fine_tune``
     :param verbose: 1 prints what is fine-tuned
     :raises ValueError: when ``learn`` begins, for a model that was not pre-trained
     """
 
-    def __init__(self, keep_actor: bool | None = None, keep_critic: bool = False, verbose: int = 1):
+    def __init__(self, keep_actor: bool | None = None, keep_critic: bool = False, verbose: int = 1, keep_reward: bool = False):
         super().__init__(verbose)
         self.keep_actor = keep_actor
         self.keep_critic = keep_critic
+        self.keep_reward = keep_reward
 
     def _on_step(self) -> bool:
         return True
@@ -118,5 +125,5 @@ class FineTuneCallback(BaseCallback):
             return
         if self.verbose >= 1:
             print(f"Fine-tuning what {model.phase_frames} frames of pre-training with {model.intrinsic_reward!r} left.")
-        model.fine_tune(keep_actor=self.keep_actor, keep_critic=self.keep_critic)
+        model.fine_tune(keep_actor=self.keep_actor, keep_critic=self.keep_critic, keep_reward=self.keep_reward)
         model.restart_episodes()

@@ -53,6 +53,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "discount_head",
     "intrinsic",
     "explores",
+    "task_reward",
     "planner",
     "planning",
     "precision",
@@ -93,7 +94,7 @@ def check(model: SavedAlgorithm) -> None:
         checks.check_rate(name, getattr(given, name))
     if given.discount_head is not None and not isinstance(given.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
-    for name in ("overlap", "reward_trains_model"):
+    for name in ("overlap", "reward_trains_model", "learn_task_reward", "freeze_decoder"):
         checks.check_switch(name, getattr(given, name))
     checks.check_noise(model)
     _check_names(given, model.phase)
@@ -114,6 +115,9 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
     if intrinsic is not None:
         intrinsic.check(particles=(given.imagination_horizon + 1) * given.batch_size * given.batch_length)
     checks.check_method(method, phase)
+    for name in ("learn_task_reward", "freeze_decoder"):
+        if getattr(given, name) and method is None:
+            raise ValueError(f"{name}=True needs a pre-training, got intrinsic_reward=None.")
     make_planner(given.planner, given.planner_kwargs, given.gae_lambda, classes=None)
     buffer_class = given.replay_buffer_class
     if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):

@@ -61,7 +61,7 @@ class DreamerV2(AgentAlgorithm):
     :param intrinsic_kwargs: hyperparameters of the intrinsic reward, for a name or a class
     :param skill_selection_starts: agent steps of fine-tuning before a skill is chosen (DIAYN, APS); until then only the
         world model learns
-    :param planner: ``"dyna_mpc"``, ``"mppi"``, another registered name, a subclass or an instance of
+    :param planner: ``"dyna_mpc"``, ``"mppi"``, ``"mppi_zero_shot"``, another registered name, a subclass or an instance of
         :class:`~sb3_dreamer_urlb.planning.Planner`, or None; acts in fine-tuning, also in ``predict``
     :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`, for a name or a class
     :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
@@ -75,6 +75,11 @@ class DreamerV2(AgentAlgorithm):
         DreamerV2)
     :param reward_trains_model: let the reward head's gradient reach the world model in fine-tuning; False as in the authors'
         fine-tuning of DIAYN and APS (docs/algorithm.md)
+    :param learn_task_reward: for ICM and RND, whose reward head learns their own reward: let a second head learn the
+        environment's beside it while pre-training, for ``fine_tune(keep_reward=True)``. The one head of every other method
+        learns it in any case
+    :param freeze_decoder: let the decoder keep its pre-trained weights in fine-tuning (paper, appendix "Latent Dynamics
+        Discrepancy")
     :param warmup_actions: of the pre-training before its first update: ``"uniform"`` in the action space; ``"saturated"``, the
         authors' own: uniform in ±A for A action dimensions, replayed as drawn and clipped for the environment (Box only)
     :param target_update_interval: updates between two copies of the critic to the slow critic
@@ -147,6 +152,8 @@ class DreamerV2(AgentAlgorithm):
         kl_scale: float = 1.0,
         actor_gradient: str = AUTO,
         reward_trains_model: bool = True,
+        learn_task_reward: bool = False,
+        freeze_decoder: bool = False,
         warmup_actions: str = arguments.UNIFORM,
         target_update_interval: int = 100,
         adam_eps: float = 1e-5,
@@ -207,6 +214,8 @@ class DreamerV2(AgentAlgorithm):
         self.kl_scale = kl_scale
         self.actor_gradient = actor_gradient
         self.reward_trains_model = reward_trains_model
+        self.learn_task_reward = learn_task_reward
+        self.freeze_decoder = freeze_decoder
         self.warmup_actions = warmup_actions
         self.target_update_interval = target_update_interval
         self.adam_eps = adam_eps
@@ -269,6 +278,7 @@ class DreamerV2(AgentAlgorithm):
             discount_head=bool(self.discount_head),
             intrinsic=self._intrinsic(),
             explores=phases.PHASES[self.phase].explores,
+            task_reward=self.learn_task_reward,
             planner=self._new_planner(),
             precision=self.precision,
             compile=self.compile,
@@ -306,6 +316,7 @@ class DreamerV2(AgentAlgorithm):
             trains_behavior=explores or self.policy.planner is None or self.policy.planner.config.use_value,
             precision=self.precision,
             compile=self.compile,
+            trains_decoder=explores or not self.freeze_decoder,
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
@@ -347,9 +358,16 @@ class DreamerV2(AgentAlgorithm):
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:
+    def _check_reward_is_known(self) -> None:
+        if self.policy.agent.known_reward() is None:
+            raise ValueError(
+                f"keep_reward=True: the reward head of this pre-training learnt the reward of {self.intrinsic_reward!r}, "
+                "not the task's. Pre-train with learn_task_reward=True, which adds a head for it."
+            )
+
+    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DreamerPolicy)
-        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
+        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic, keep_reward)
 
     def fix_skill(self, skill: int | np.ndarray | None) -> None:
         """Follow one skill from now on, in training as in ``predict`` (DIAYN, APS).

@@ -26,12 +26,17 @@ TRANSFER: dict[str, str] = {
 SKILL_STATES = 4096
 
 
-def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool) -> None:
-    """Copy what ``TRANSFER`` keeps from one agent into a fresh one of the same sizes.
+def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool, keep_reward: bool = False) -> None:
+    """Copy what ``TRANSFER`` keeps from one agent into a fresh one of the same sizes; the task's reward head if it is known.
 
     :param source: pre-trained
     :param target: fresh; changed in place
     :param keep_actor: see ``TRANSFER``
     :param keep_critic: see ``TRANSFER``
+    :param keep_reward: begin with the task's reward head, which the source must have
     """
     transfer_parts(source, target, TRANSFER, keep_actor, keep_critic)
+    if keep_reward:
+        known = source.known_reward()
+        assert known is not None
+        target.world_model.reward.load_state_dict(known.state_dict())

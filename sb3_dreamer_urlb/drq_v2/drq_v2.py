@@ -212,7 +212,7 @@ class DrQv2(AgentAlgorithm):
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool) -> None:
+    def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DrQPolicy)
         transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
 

@@ -26,6 +26,11 @@ class RewardSource(nn.Module):
     #: μ of the reward normaliser; 1 switches it off (docs/algorithm.md, "Behaviour")
     momentum: ClassVar[float] = 1.0
 
+    @property
+    def labels_replay(self) -> bool:
+        """Whether the reward head learns a reward of this module's own in place of the task's (ICM, RND)."""
+        return type(self).replay_reward is not RewardSource.replay_reward
+
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics] | None:
         """What the module itself learns from a replayed batch; None if there is nothing to learn.
 

@@ -16,6 +16,7 @@ from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
+from sb3_dreamer_urlb.nn import distributions
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, Observation, Posterior, SequenceBatch
 
 
@@ -41,6 +42,7 @@ class LearnerConfig:
     kl_scale: float = 1.0
     actor_gradient: str = DYNAMICS
     compile: str = "eager"
+    trains_decoder: bool = True
 
 
 class Learner(BaseLearner[Agent, SequenceBatch]):
@@ -57,6 +59,8 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
     def __init__(self, agent: Agent, config: LearnerConfig):
         super().__init__(agent, config.compile, config.precision, agent.world_model.sizes.feature)
         self.config = config
+        # Frozen, what a latent state looks like stays what it was (paper, appendix "Latent Dynamics Discrepancy").
+        agent.world_model.decoder.requires_grad_(config.trains_decoder)
         self.model_optimizer = self._optimizer(agent.world_model, config.learning_rate)
         self.actor_optimizer = self._optimizer(agent.actor, config.actor_learning_rate)
         self.critic_optimizer = self._optimizer(agent.critic, config.critic_learning_rate)
@@ -66,6 +70,9 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
             self.reward_source = agent.intrinsic
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
+        self.task_reward_optimizer: ClippedAdam | None = None
+        if agent.task_reward is not None:
+            self.task_reward_optimizer = self._optimizer(agent.task_reward, config.learning_rate)
         statistics = [agent.reward_normalizer, *([] if agent.intrinsic is None else [agent.intrinsic])]
         self._get_ready(statistics, agent.intrinsic)
 
@@ -93,6 +100,7 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
             "actor_optimizer": self.actor_optimizer,
             "critic_optimizer": self.critic_optimizer,
             "intrinsic_optimizer": self.intrinsic_optimizer,
+            "task_reward_optimizer": self.task_reward_optimizer,
         }
         return {name: optimizer for name, optimizer in found.items() if optimizer is not None}
 
@@ -116,6 +124,7 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
             posterior = model.observe(observation, batch.action, batch.is_first)
         metrics = self._update_intrinsic(_detached(posterior), batch)
         metrics.update(self._update_world_model(posterior, observation, batch))
+        metrics.update(self._update_task_reward(_detached(posterior), batch))
         if self.trains_behavior():
             metrics.update(self._update_behavior(posterior.state.detach(), batch.is_terminal))
             if self.agent.explores:
@@ -146,6 +155,15 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
             metrics["intrinsic_replay_reward_std"] = reward.std()
         metrics["model_grad_norm"] = self.model_optimizer.step(loss)
         return metrics
+
+    def _update_task_reward(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
+        """What the task would pay, learnt beside the intrinsic reward; touches neither model nor exploration."""
+        head, optimizer = self.agent.task_reward, self.task_reward_optimizer
+        if head is None or optimizer is None:
+            return {}
+        with self._products():
+            loss = distributions.unit_normal_nll(head(posterior.feature), batch.reward).mean()
+        return {"task_reward_grad_norm": optimizer.step(loss), "task_reward_loss": loss.detach()}
 
     def _update_behavior(self, start: LatentState, is_terminal: th.Tensor) -> Metrics:
         agent, config = self.agent, self.config

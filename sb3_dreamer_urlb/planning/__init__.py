@@ -22,3 +22,10 @@ __all__ = [
 register_planner("dyna_mpc", DynaMPC, CategoricalDynaMPC)
 # MPPI trusts rewards only: no critic, no actor proposals.
 register_planner("mppi", DynaMPC, CategoricalDynaMPC, settled={"use_value": False, "mixture": 0.0})
+# The paper's zero-shot study: looks further, with more trajectories (appendix "Zero-shot Adaptation").
+register_planner(
+    "mppi_zero_shot",
+    DynaMPC,
+    CategoricalDynaMPC,
+    settled={"use_value": False, "mixture": 0.0, "n_samples": 1000, "top_k": 100, "horizon": 15},
+)

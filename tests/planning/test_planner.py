@@ -233,6 +233,9 @@ def test_numbers_that_are_none_are_refused(fields):
 def test_the_papers_planner():
     config = make_planner("dyna_mpc", None, 0.95).config
     assert config == PlannerConfig(5, 512, 12, 64, 0.05, 0.5, 0.1, 0.1, True) and config.actor_trajectories == 25
+    zero_shot = make_planner("mppi_zero_shot", {"horizon": 3, "iterations": 2}, 0.95).config
+    numbers = (zero_shot.n_samples, zero_shot.top_k, zero_shot.horizon, zero_shot.actor_trajectories, zero_shot.use_value)
+    assert numbers == (1000, 100, 15, 0, False) and zero_shot.iterations == 2
     mppi = make_planner("mppi", {"horizon": 15}, 0.95).config
     assert (mppi.use_value, mppi.mixture, mppi.horizon) == (False, 0.0, 15)
     assert make_planner(None, None, 0.95) is None
