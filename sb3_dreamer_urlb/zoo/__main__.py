@@ -1,4 +1,4 @@
-"""``python -m sb3_dreamer_urlb.zoo train|enjoy|...``: rl_zoo3's commands with ``--algo dreamerv2``."""
+"""``python -m sb3_dreamer_urlb.zoo train|enjoy|...``: rl_zoo3's commands with ``--algo dreamerv2`` and ``--algo drq_v2``."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Register DreamerV2 and hand over to rl_zoo3.
+    """Register our algorithms and hand over to rl_zoo3.
 
     :param argv: arguments, those of the process if None
     :return: exit status
     """
     parser = argparse.ArgumentParser(
         prog="python -m sb3_dreamer_urlb.zoo",
-        description="rl_zoo3 with --algo dreamerv2.",
+        description="rl_zoo3 with --algo dreamerv2 or drq_v2.",
         epilog="\n".join(f"{name:14}{text}" for name, text in COMMANDS.items())
         + "\n\nAll else goes to rl_zoo3; '<command> --help' lists it.",
         formatter_class=argparse.RawDescriptionHelpFormatter,

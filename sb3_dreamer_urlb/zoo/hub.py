@@ -20,7 +20,9 @@ import yaml
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
-from sb3_dreamer_urlb.zoo.registration import ALGORITHM
+
+#: rl_zoo3's name of the algorithm that these commands share
+ALGORITHM = "dreamerv2"
 
 CONFIG, ARGUMENTS, ENV_KWARGS, METRICS = "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip"
 #: of the command line that trained; the rest names things of that machine

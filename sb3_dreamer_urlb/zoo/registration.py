@@ -1,4 +1,4 @@
-"""Puts DreamerV2 into rl_zoo3, and mends the places where rl_zoo3 knows nothing of phases and of runs that go on.
+"""Puts our algorithms into rl_zoo3, and mends the places where rl_zoo3 knows nothing of phases and of runs that go on.
 
 rl_zoo3 has no entry points: its modules share two dictionaries and a class, which are changed here in place.
 """
@@ -20,48 +20,44 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
 from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback
 from sb3_dreamer_urlb.callbacks.videos import VideoCallback
-from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.zoo import configs, pretraining, resuming
+from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
-from sb3_dreamer_urlb.zoo.sampler import convert_dreamer_v2_params, sample_dreamer_v2_params
-
-#: rl_zoo3's name of the algorithm; the hub looks for the class's name in lower case
-ALGORITHM = "dreamerv2"
-#: what ``train`` reads without ``-conf``: the first of these that knows the environment
-DEFAULT_CONFIGS = [configs.folder() / name for name in ("lbs.yml", "vectors.yml")]
 
 
 def register() -> None:
-    """Make ``--algo dreamerv2`` known to rl_zoo3. May be called again."""
-    algorithms = importlib.import_module("rl_zoo3.utils").ALGOS
+    """Make ``--algo dreamerv2`` and ``--algo drq_v2`` known to rl_zoo3. May be called again."""
+    known = importlib.import_module("rl_zoo3.utils").ALGOS
     optimization = importlib.import_module("rl_zoo3.hyperparams_opt")
-    algorithms[ALGORITHM] = DreamerV2
-    optimization.HYPERPARAMS_SAMPLER[ALGORITHM] = sample_dreamer_v2_params
-    optimization.HYPERPARAMS_CONVERTER[ALGORITHM] = convert_dreamer_v2_params
+    for name, algorithm in ALGORITHMS.items():
+        known[name] = algorithm.kind
+        optimization.HYPERPARAMS_SAMPLER[name] = algorithm.sampler
+        optimization.HYPERPARAMS_CONVERTER[name] = algorithm.converter
     # The class is absent while its own module is what imports custom_envs.py (record_video), where nobody trains.
     manager = getattr(importlib.import_module("rl_zoo3.exp_manager"), "ExperimentManager", None)
     if manager is not None:
         for name, around in _AROUND.items():
             original = getattr(manager, name)
-            if not hasattr(original, "_of_dreamer_v2"):
+            if not hasattr(original, "_knows_phases"):
                 setattr(manager, name, _wrap(original, around))
 
 
 def _wrap(original: Callable[..., Any], around: Callable[..., Any]) -> Callable[..., Any]:
-    """``around(original, manager, ...)`` in place of ``original(manager, ...)``, for our algorithm only."""
+    """``around(original, manager, ...)`` in place of ``original(manager, ...)``, for our algorithms only."""
 
     @functools.wraps(original)
     def wrapped(manager: Any, *args: Any, **kwargs: Any) -> Any:
-        if manager.algo != ALGORITHM:
+        if manager.algo not in ALGORITHMS:
             return original(manager, *args, **kwargs)
         return around(original, manager, *args, **kwargs)
 
-    wrapped._of_dreamer_v2 = True  # type: ignore[attr-defined]
+    wrapped._knows_phases = True  # type: ignore[attr-defined]
     return wrapped
 
 
@@ -83,7 +79,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
         pprint(config)
     else:
         if getattr(options, "conf_file", manager.config) is None:
-            manager.config = str(_default_config(manager.env_name.gym_id))
+            manager.config = str(_default_config(manager.algo, manager.env_name.gym_id))
         else:
             manager.config = configs.resolve(manager.config)
         hyperparams, config = original(manager)
@@ -106,8 +102,8 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     return hyperparams, config
 
 
-def _default_config(env_id: str) -> Path:
-    there = [path for path in DEFAULT_CONFIGS if path.is_file()]
+def _default_config(algorithm: str, env_id: str) -> Path:
+    there = [path for name in ALGORITHMS[algorithm].configs if (path := configs.folder() / name).is_file()]
     if not there:
         raise ValueError(f"Name a configuration with -conf: {configs.folder()} is not there.")
     knowing = [path for path in there if env_id in yaml.safe_load(path.read_text())]
@@ -182,18 +178,19 @@ def _load_pretrained_agent(
 
     :raises ValueError: for a snapshot that was made with other networks than the configuration says
     """
+    kind = ALGORITHMS[manager.algo].kind
     expected: dict[str, Any] = {name: hyperparams.pop(name) for name in ("preset", "intrinsic_reward") if name in hyperparams}
     if getattr(manager, "resumed_run", None) is not None:
         changed = {name: hyperparams[name] for name in manager.custom_hyperparams or {} if name in hyperparams}
         own = {"tensorboard_log": manager.tensorboard_log, "verbose": manager.verbose}
         folder = manager.resumed_run / resuming.CHECKPOINT
-        resumed = DreamerV2.resume(folder, env, device=manager.device, **{**own, **changed})
+        resumed = kind.resume(folder, env, device=manager.device, **{**own, **changed})
         assert resumed is not None
         _check_expected(manager.resumed_run, expected, resumed)
         return resumed
     fine_tunes = any(isinstance(callback, FineTuneCallback) for callback in manager.callbacks)
-    load = functools.partialmethod(_load_fitting_buffer, DreamerV2.load_replay_buffer, fine_tunes)
-    with mock.patch.object(DreamerV2, "load_replay_buffer", load):
+    load = functools.partialmethod(_load_fitting_buffer, kind.load_replay_buffer, fine_tunes)
+    with mock.patch.object(kind, "load_replay_buffer", load):
         model = original(manager, hyperparams, env)
     _check_expected(manager.trained_agent, expected, model)
     return model
@@ -209,7 +206,7 @@ def _check_expected(source: str | Path, expected: dict[str, Any], model: BaseAlg
 
 
 def _load_fitting_buffer(
-    model: DreamerV2, load: Callable[..., None], fine_tunes: bool, path: str, truncate_last_traj: bool = True
+    model: PhasedAlgorithm, load: Callable[..., None], fine_tunes: bool, path: str, truncate_last_traj: bool = True
 ) -> None:
     """In place of ``model.load_replay_buffer``: rl_zoo3 loads any file that lies beside a snapshot, unasked."""
     if fine_tunes and model.phase == PRETRAINING:
