@@ -29,11 +29,16 @@ from sb3_dreamer_urlb import DreamerV2, native
 
 
 class NoiseImages(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Walker-sized images of noise: what is timed does not depend on their content."""
+    """Walker-sized images of noise: what is timed does not depend on their content.
 
-    observation_space = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+    :param size: height and width
+    """
+
     action_space = spaces.Box(-1, 1, (6,), np.float32)
     never_terminates = True
+
+    def __init__(self, size: int = 64) -> None:
+        self.observation_space = spaces.Box(0, 255, (size, size, 3), np.uint8)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
@@ -45,7 +50,7 @@ class NoiseImages(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._image(), 0.5, False, self.steps == 100, {}
 
     def _image(self) -> np.ndarray:
-        return self.np_random.integers(0, 256, (64, 64, 3), np.uint8)
+        return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:

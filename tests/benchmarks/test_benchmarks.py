@@ -161,6 +161,13 @@ def test_methods(run, load, monkeypatch):
     assert list(result["seconds"]) == ["lbs", "icm"] and all(is_positive(times) for times in result["seconds"].values())
 
 
+def test_drq_v2(run):
+    table, result = run("drq_v2", "--precision", "float32", "--phases", "task", "pre-training")
+    assert table.startswith("drq_v2: device ")
+    assert set(result["seconds"]) == {"task, float32", "pre-training, float32", "sampling"}
+    assert all(is_positive(times) for times in result["seconds"].values())
+
+
 def test_collect_compares_with_dm_control_alone_and_names_what_cannot_draw(run, load, tmp_path):
     picture = tmp_path / "collect.png"
     backend, kinds = load_renderer(), load("collect").KINDS[::2]  # SB3's own processes take long to start
