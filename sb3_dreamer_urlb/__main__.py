@@ -13,7 +13,7 @@ from typing import Any
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
-MODULES = ("compare", "evaluate", "figures", "report", "tasks")
+MODULES = ("compare", "discrepancy", "evaluate", "figures", "oracle_reward", "report", "tasks", "zero_shot")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     old.add_argument("old", type=Path)
     old.add_argument("new", type=Path)
     old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
-    modules = {name: import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
+    modules = {name.replace("_", "-"): import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
     for name, module in modules.items():
         module.add_arguments(commands.add_parser(name, help=module.HELP, description=module.__doc__))
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}

@@ -78,11 +78,12 @@ def run(options: dict[str, Any]) -> int:
     return 0
 
 
-def load_agent(options: dict[str, Any], envs: int) -> tuple[Any, VecEnv]:
+def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[Any, VecEnv]:
     """A saved agent and an environment for it.
 
     :param options: of the command line: ``snapshot``, ``env``, ``device``, and, if given, ``env_kwargs``, ``vec_normalize``
     :param envs: how many environments
+    :param arguments: of the model, in place of those in the file
     """
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -97,7 +98,7 @@ def load_agent(options: dict[str, Any], envs: int) -> tuple[Any, VecEnv]:
     try:
         statistics = options.get("vec_normalize")
         env = normalized_as_saved(env, path) if statistics is None else load_vec_normalize(statistics, env)
-        return algorithm_of(path).load(path, env=env, device=options["device"]), env
+        return algorithm_of(path).load(path, env=env, device=options["device"], **arguments), env
     except BaseException:
         env.close()
         raise

@@ -36,7 +36,7 @@ def row_of(
     :param keep_critic: likewise for the critic
     :param columns: further columns, or other values for required ones
     """
-    facts = {**env_columns(env), **_agent_columns(model, keep_actor, keep_critic)}
+    facts = {**env_columns(env), **agent_columns(model, keep_actor, keep_critic)}
     facts |= {
         "planner": evaluation.planner,
         "return_mean": evaluation.mean,
@@ -53,7 +53,13 @@ def row_of(
     return Row(**facts, further=further)
 
 
-def _agent_columns(model: Any, keep_actor: bool | None, keep_critic: bool) -> dict[str, Any]:
+def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool = False) -> dict[str, Any]:
+    """What a model tells about itself: method, seed, frames, what it kept, preset, algorithm.
+
+    :param model: any of Stable-Baselines3
+    :param keep_actor: see :func:`row_of`
+    :param keep_critic: likewise
+    """
     algorithm = type(model).__name__
     reward = getattr(model, "intrinsic_reward", None)
     exploring = PHASES[model.phase].explores if hasattr(model, "phase") else False

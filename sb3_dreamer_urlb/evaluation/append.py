@@ -6,7 +6,7 @@ import csv
 import fcntl
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -65,6 +65,49 @@ def append_rows(path: str | os.PathLike[str], rows: Iterable[Row]) -> int:
         if new:
             _write(path, new)
         return len(new)
+
+
+def change_rows(path: str | os.PathLike[str], matches: Callable[[Row], bool], columns: Mapping[str, str]) -> int:
+    """Write columns of rows that stand in a file; all else stays as it is, what cannot be read included.
+
+    :param path: of the CSV file, which must be there
+    :param matches: which rows
+    :param columns: further columns and their texts
+    :return: how many rows match
+    :raises ValueError: for a required column, or a file that holds no rows
+    :raises OSError: if it cannot be written; the file is as it was
+    """
+    path = Path(path)
+    if clash := set(columns) & {*REQUIRED, WRITTEN}:
+        raise ValueError(f"columns must be others than {', '.join(sorted(clash))}")
+    with _locked(path):
+        content = path.read_bytes()
+        old = header(lines_of(content, "replace")[0], path)
+        added = sorted(set(columns) - set(old))
+        wide = [*(name for name in old if name != WRITTEN), *added, *([WRITTEN] if WRITTEN in old else [])]
+        lines, changed = [], 0
+        for line in lines_of(_widened(content, old, wide), "surrogateescape"):
+            if not line.strip():
+                continue
+            found = _row_of(wide, line)
+            if found is not None and matches(found[1]):
+                line = line_of({**found[0], **columns}[name] for name in wide).rstrip("\n")
+                changed += 1
+            lines.append(line + "\n")
+        if changed:
+            with written_atomically(path) as file:
+                file.write((line_of(wide) + "".join(lines)).encode("utf-8", "surrogateescape"))
+        return changed
+
+
+def _row_of(columns: list[str], line: str) -> tuple[dict[str, str], Row] | None:
+    """The cells of a line and what they say; None for a line that cannot be read."""
+    try:
+        cells = next(csv.reader([line], strict=True), [])
+        values = dict(zip(columns, cells, strict=True))
+        return values, parse(values, strict=False)
+    except (csv.Error, ValueError):
+        return None
 
 
 @contextmanager

@@ -61,6 +61,15 @@ class RSSM(nn.Module):
         deter = self._recur(state, self._action_part(action))
         return LatentState(self._sample(self._prior_logits(deter), generator), deter)
 
+    def predict_logits(self, state: LatentState, action: th.Tensor) -> th.Tensor:
+        """The prior of the next state, p(z_t | z_{t-1}, a_{t-1}), itself.
+
+        :param state: z_{t-1}, (n, …)
+        :param action: a_{t-1}, float (n, A)
+        :return: logits, float (n, S, K)
+        """
+        return self._prior(self._recur(state, self._action_part(action)))
+
     def planning_step(
         self, state: LatentState, action: th.Tensor, stoch_rows: th.Tensor, generator: th.Generator | None = None
     ) -> LatentState:

@@ -1,0 +1,64 @@
+"""What the commands share that ask how agents see the trajectories of an oracle."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.analysis.trajectories import Trajectory
+
+
+def add_oracle_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of a command
+    """
+    parser.add_argument("--env", required=True, help="id of the task's environment, such as urlb/walker-run-v0")
+    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
+    parser.add_argument("--oracle", type=Path, help="snapshot of an agent that has learnt the task: it plays")
+    parser.add_argument("--trajectories", type=Path, help="folder of recorded episodes; with --oracle they are written there")
+    parser.add_argument("--count", type=int, default=30, help="trajectories (default: %(default)s, the paper's)")
+    parser.add_argument("--seed", type=int, default=2000, help="of the first trajectory (default: %(default)s)")
+    parser.add_argument("--rows", type=Path, help="CSV file of evaluations: the number is written beside this agent's")
+    parser.add_argument("--device", default="auto", help="(default: %(default)s)")
+
+
+def trajectories_of(options: dict[str, Any]) -> list[Trajectory]:
+    """What the oracle plays, or played.
+
+    :param options: of the command line
+    :raises ValueError: if neither an oracle nor a folder is given, or too few episodes are there
+    """
+    from sb3_dreamer_urlb.analysis.trajectories import load_trajectories, play_trajectories, save_trajectories
+    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_integer("--count", options["count"], 1)
+    if "oracle" not in options:
+        if "trajectories" not in options:
+            raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
+        return load_trajectories(options["trajectories"], options["count"])
+    oracle, env = load_agent({**options, "snapshot": options["oracle"]}, min(options["count"], 10))
+    try:
+        played = play_trajectories(oracle, env, options["count"], options["seed"])
+    finally:
+        env.close()
+    returns = [float(one.rewards.sum()) for one in played]
+    print(f"{options['oracle']}: {len(played)} trajectories, return {sum(returns) / len(returns):.1f}")
+    if "trajectories" in options:
+        save_trajectories(played, options["trajectories"])
+    return played
+
+
+def print_values(what: str, values: list[float]) -> float:
+    """A line a trajectory, then the mean; returns it.
+
+    :param what: was measured
+    :param values: one a trajectory
+    """
+    for i, value in enumerate(values):
+        print(f"  trajectory {i:3d}: {value:.6g}")
+    mean = sum(values) / len(values)
+    print(f"{what}: {mean:.6g} (mean of {len(values)} trajectories)")
+    return mean

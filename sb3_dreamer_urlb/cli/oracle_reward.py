@@ -1,0 +1,43 @@
+"""Mean intrinsic reward of a pre-trained snapshot along an oracle's trajectories."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from sb3_dreamer_urlb.cli.oracle import add_oracle_arguments, print_values, trajectories_of
+
+HELP = "how interesting a pre-trained agent finds an oracle's trajectories"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("snapshot", type=Path, help="pre-trained, not fine-tuned")
+    add_oracle_arguments(parser)
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for a model without an intrinsic reward, or too few trajectories
+    :raises FileNotFoundError: if there is no such snapshot, folder or file
+    """
+    from sb3_dreamer_urlb.analysis.annotate import INTRINSIC_REWARD, about, annotate
+    from sb3_dreamer_urlb.analysis.novelty import check_has_intrinsic_reward, intrinsic_reward_on
+    from sb3_dreamer_urlb.cli.evaluate import load_agent
+
+    model, env = load_agent(options, 1)
+    try:
+        check_has_intrinsic_reward(model)
+        values = intrinsic_reward_on(model, trajectories_of(options), options["seed"])
+        mean = print_values(f"Intrinsic reward of {model.intrinsic_reward}", values)
+        if "rows" in options:
+            count = annotate(options["rows"], about(model, env, tuned=True), INTRINSIC_REWARD, mean)
+            print(f"  column {INTRINSIC_REWARD} of {count} rows of {options['rows']}")
+    finally:
+        env.close()
+    return 0

@@ -1,0 +1,89 @@
+"""The analyses from the command line, one after the other: a small study, done by hand and by the commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from counter_task import ENV
+
+from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.analysis.annotate import annotate
+from sb3_dreamer_urlb.analysis.discrepancy import latent_dynamics_discrepancy
+from sb3_dreamer_urlb.analysis.novelty import intrinsic_reward_on
+from sb3_dreamer_urlb.analysis.trajectories import load_trajectories
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+
+SMALL = ("--episodes", "1", "--device", "cpu")
+
+
+def test_the_whole_study(snapshots, weights, tmp_path, capsys):
+    pretrained, tuned, rows, episodes = snapshots(), tmp_path / "tuned.zip", tmp_path / "rows.csv", tmp_path / "episodes"
+    options = ["--finetune-frames", "56", "--freeze-decoder", "--save", str(tuned), "--rows", str(rows)]
+    assert main(["zero-shot", str(pretrained), "--env", ENV, *options, *SMALL]) == 0
+    shot, after = sorted(read_rows(rows).rows, key=lambda row: row.finetune_frames)
+    for row, how, frames in ((shot, "zero_shot", 0), (after, "fine_tuned", 56)):
+        about = (row.method, row.domain, row.task, row.seed, row.pretrain_frames, row.finetune_frames, row.planner)
+        assert about == ("lbs", "walker", "run", 0, 56, frames, "mppi_zero_shot")
+        assert (row["adaptation"], row["known_reward"], row.return_mean, row.keep_actor) == (how, "true", 4.0, False)
+    before, model = (DreamerV2.load(path, device="cpu") for path in (pretrained, tuned))
+    parts = [one.policy.agent.world_model for one in (before, model)]
+    assert weights(parts[0].decoder) == weights(parts[1].decoder) and weights(parts[0].rssm) != weights(parts[1].rssm)
+
+    oracle = ["--env", ENV, "--oracle", str(tuned), "--trajectories", str(episodes), "--count", "2", "--device", "cpu"]
+    assert main(["discrepancy", str(pretrained), str(tuned), *oracle, "--rows", str(rows)]) == 0
+    played = load_trajectories(episodes, 2)
+    by_hand = np.mean(latent_dynamics_discrepancy(before, model, played))
+    shot, after = sorted(read_rows(rows).rows, key=lambda row: row.finetune_frames)
+    assert shot["ldd"] == "" and float(after["ldd"]) == pytest.approx(by_hand, rel=1e-5) and by_hand > 0
+
+    recorded = ["--env", ENV, "--trajectories", str(episodes), "--count", "2", "--device", "cpu", "--rows", str(rows)]
+    assert main(["oracle-reward", str(pretrained), *recorded]) == 0
+    after = max(read_rows(rows).rows, key=lambda row: row.finetune_frames)
+    assert float(after["intrinsic_reward"]) == pytest.approx(np.mean(intrinsic_reward_on(before, played)), rel=1e-5)
+    assert float(after["ldd"]) == pytest.approx(by_hand, rel=1e-5) and len(read_rows(rows).rows) == 2
+    assert "mean of 2 trajectories" in capsys.readouterr().out
+
+    pytest.importorskip("matplotlib")
+    assert main(["figures", str(rows), "--out", str(tmp_path / "figures"), "--repetitions", "10"]) == 0
+    drawn = {path.stem for path in (tmp_path / "figures").rglob("*.png")}
+    assert {"discrepancy", "zero_shot"} <= drawn
+
+
+@pytest.mark.parametrize(("method", "said"), [("icm", "learn_task_reward=True"), ("tuned", "needs a pre-trained snapshot")])
+def test_who_cannot_plan_at_once_is_refused_before_anything(snapshots, tuned, tmp_path, capsys, method, said):
+    path = tuned if method == "tuned" else snapshots(method)
+    assert main(["zero-shot", str(path), "--env", ENV, "--rows", str(tmp_path / "rows.csv"), *SMALL]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "rows.csv").exists()
+
+
+def test_a_second_head_is_a_known_reward(snapshots, capsys):
+    path = snapshots("icm", learn_task_reward=True)
+    assert main(["zero-shot", str(path), "--env", ENV, *SMALL]) == 0
+    assert "zero_shot: return 4.0" in capsys.readouterr().out
+
+
+def test_neither_oracle_nor_folder(snapshots, tuned, capsys):
+    assert main(["discrepancy", str(snapshots()), str(tuned), "--env", ENV, "--device", "cpu"]) == 2
+    assert "Give --oracle" in capsys.readouterr().err
+
+
+def test_options_that_ask_for_nothing(snapshots, capsys):
+    assert main(["zero-shot", str(snapshots()), "--env", ENV, "--freeze-decoder", *SMALL]) == 2
+    assert "need --finetune-frames" in capsys.readouterr().err
+
+
+def test_a_file_without_the_agent_stays_as_it_is(tmp_path):
+    path = tmp_path / "rows.csv"
+    head = "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset"
+    text = f"{head},return_mean,return_std,episodes,seconds\nlbs,walker,run,0,2M,100k,true,false,none,paper,1,0,10,1\nhalf,\n"
+    path.write_text(text)
+    with pytest.raises(ValueError, match="no row about this agent"):
+        annotate(path, lambda row: row.seed == 1, "ldd", 0.5)
+    assert path.read_text() == text
+    with pytest.raises(FileNotFoundError, match="no file"):
+        annotate(tmp_path / "none.csv", lambda row: True, "ldd", 0.5)
+    assert annotate(path, lambda row: row.seed == 0, "ldd", 0.5) == 1
+    assert annotate(path, lambda row: row.seed == 0, "ldd", 0.25) == 1
+    found = read_rows(path)
+    assert [row["ldd"] for row in found.rows] == ["0.25"] and len(found.skipped) == 1
