@@ -235,7 +235,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
             self.set_env(env)
             normalized.carry_over(before, self._vec_normalize_env)
         if keep_actor is None:
-            keep_actor = self._keeps_actor()
+            keep_actor = self.keeps_actor()
         pretrained = self.policy
         self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
@@ -245,7 +245,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         self._transfer(pretrained, keep_actor, keep_critic, keep_reward)
         self._last_obs = None
 
-    def _keeps_actor(self) -> bool:
+    def keeps_actor(self) -> bool:
         """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule."""
         return phases.keeps_actor(self.domain)
 

@@ -118,7 +118,8 @@ class VideoCallback(BaseCallback):
             played = recording.record(model, self._env(), self.video_length, self.deterministic)
             self._put(AGENT, played.frames, played.fps)
             kind = model.policy.observations
-            if not has_image(kind) or len(played.actions) < self.open_loop_start + self.context:
+            dreams = hasattr(model.policy.agent, "world_model")
+            if not dreams or not has_image(kind) or len(played.actions) < self.open_loop_start + self.context:
                 return
             truth, predicted = predict_open_loop(
                 model.policy, played.observations, played.actions, self.open_loop_start, self.context, self.horizon

@@ -216,8 +216,8 @@ class DrQv2(AgentAlgorithm):
         assert isinstance(pretrained, DrQPolicy)
         transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
 
-    def _keeps_actor(self) -> bool:
-        # The benchmark keeps it whatever the task; the rule by tasks is the paper's for its own agent.
+    def keeps_actor(self) -> bool:
+        """Whether fine-tuning keeps the actor where nobody says: always, as the benchmark does for this agent."""
         return True
 
     def _warms_up_randomly(self) -> bool:

@@ -71,7 +71,8 @@ def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool 
         method = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
     tuned = pretrained > 0 and not exploring
     if tuned and keep_actor is None:
-        keep_actor = keeps_actor(getattr(model, "domain", None))
+        rule = getattr(model, "keeps_actor", None)
+        keep_actor = keeps_actor(getattr(model, "domain", None)) if rule is None else rule()
     return {
         "method": method,
         "seed": -1 if model.seed is None else model.seed,

@@ -163,7 +163,7 @@ def _picture(model: DreamerV2, env: VecEnv, observation: Any) -> np.ndarray:
     if env.render_mode == "rgb_array":
         return _rendered(env)
     policy = model.policy
-    image = image_of(policy.observations, policy.agent.world_model.preprocess(_stacked([observation])))
+    image = image_of(policy.observations, policy.observations.preprocess(_stacked([observation])))
     assert image is not None
     shown: np.ndarray = pictures(image)[0]
     return shown
