@@ -15,6 +15,8 @@ from sb3_dreamer_urlb.evaluation.rows import Row
 
 #: columns of measurements
 DISCREPANCY, INTRINSIC_REWARD = "ldd", "intrinsic_reward"
+#: columns that make another task of a task
+CHANGES = ("observation", "perturbation", "variant")
 
 
 def about(model: Any, env: VecEnv, tuned: bool) -> Callable[[Row], bool]:
@@ -29,6 +31,7 @@ def about(model: Any, env: VecEnv, tuned: bool) -> Callable[[Row], bool]:
     def matches(row: Row) -> bool:
         same = (row.method, row.domain, row.task, row.seed) == (own["method"], task["domain"], task["task"], own["seed"])
         frames = row.finetune_frames > 0 if tuned else row.finetune_frames == own["finetune_frames"]
+        same = same and all(row[name] == task.get(name, "") for name in CHANGES)
         return same and row.pretrain_frames == own["pretrain_frames"] and frames
 
     return matches

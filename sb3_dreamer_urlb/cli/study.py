@@ -1,0 +1,63 @@
+"""The paper's ablations: list their runs, and do what is missing. Started again, it goes on."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+HELP = "list the runs of one of the paper's ablations, and do those that are missing"
+#: options that change the paper's plan
+PLANNED = ("methods", "tasks", "seeds", "pretrain_frames", "finetune_frames")
+NAMES = ("known-reward", "zero-shot", "modules", "longer", "sparsity")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("name", choices=NAMES, help="which ablation")
+    parser.add_argument("action", choices=("list", "run"), help="say what is done and what is missing, or do it")
+    parser.add_argument("--folder", type=Path, required=True, help="of the study: rows.csv, snapshots, runs under way")
+    parser.add_argument("--methods", nargs="+", help="intrinsic rewards (default: the paper's)")
+    parser.add_argument("--tasks", nargs="+", help="such as walker-run (default: the paper's)")
+    parser.add_argument("--seeds", type=int, help="how many (default: 3)")
+    parser.add_argument("--pretrain-frames", type=int, nargs="+", help="lengths of the pre-training (default: the paper's)")
+    parser.add_argument("--finetune-frames", type=int, help="(default: 100000)")
+    parser.add_argument("--episodes", type=int, default=10, help="of an evaluation (default: %(default)s)")
+    parser.add_argument("--preset", default="paper", help="of the models (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
+    parser.add_argument("--at-most", type=int, help="fine-tunings")
+    parser.add_argument("--device", default="auto", help="(default: %(default)s)")
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for a study without runs, or unknown tasks
+    """
+    from dataclasses import replace
+
+    from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, runs_of
+    from sb3_dreamer_urlb.analysis.study import StudyFolder
+    from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_integer("--episodes", options["episodes"], 1)
+    given: dict[str, Any] = {name.removesuffix("_frames"): options[name] for name in PLANNED if name in options}
+    manifest = MANIFESTS[options["name"]]
+    given = {name: tuple(one) if isinstance(one, list) else one for name, one in given.items()}
+    plan = replace(manifest.plan, **given)
+    for method in plan.methods:
+        make_intrinsic_reward(method)
+    runs = runs_of(options["name"], plan)
+    study = StudyFolder(options["folder"], {"preset": options["preset"], "device": options["device"]}, options["episodes"])
+    if options["action"] == "list":
+        missing = set(study.missing(runs))
+        for one in runs:
+            print("missing" if one in missing else "done   ", one.name)
+        print(f"{len(runs) - len(missing)} of {len(runs)} done; figure {manifest.figure} of `figures {study.rows}`")
+        return 0
+    study.work(runs, options["minutes"], options.get("at_most"))
+    return 0

@@ -1,0 +1,122 @@
+"""The paper's ablations as lists of runs, and the runner that does what is missing."""
+
+from __future__ import annotations
+
+import gymnasium
+import pytest
+from counter_task import ENV
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, Plan, runs_of
+from sb3_dreamer_urlb.analysis.study import StudyFolder
+from sb3_dreamer_urlb.cli.study import NAMES
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+
+SMALL = {"seeds": 1, "methods": ("lbs",), "tasks": ("walker-run",), "pretrain": (40, 56), "finetune": 48}
+
+
+def small(name, **changes):
+    return runs_of(name, Plan(**{**SMALL, **changes}))
+
+
+def make_env(name, count):
+    """A cheap environment in the place of whichever was asked for."""
+    assert name in gymnasium.registry
+    return make_vec_env(ENV, count)
+
+
+def folder(path):
+    return StudyFolder(path, {"preset": "tiny", "device": "cpu", "learning_starts": 12}, 1, make_env)
+
+
+def test_the_papers_plans():
+    assert set(MANIFESTS) == set(NAMES)
+    counts = {name: len(runs_of(name, manifest.plan)) for name, manifest in MANIFESTS.items()}
+    # seeds · tasks · methods · arms
+    assert counts == {
+        "known-reward": 3 * 12 * 7 * 2,
+        "zero-shot": 3 * 12 * 1 * 2,
+        "modules": 3 * 12 * 7 * 6,
+        "longer": 3 * 12 * 7 * 7,
+        "sparsity": 3 * 4 * 7 * 6,
+    }
+    for name, manifest in MANIFESTS.items():
+        runs = runs_of(name, manifest.plan)
+        assert len({run.name for run in runs}) == len(runs)
+        assert all(env in gymnasium.registry for run in runs for env in (run.env, run.start.env))
+        assert all(run.start.env.startswith(run.env.rpartition("-")[0][:9]) for run in runs)
+
+
+def test_a_reward_is_known_where_it_was_seen():
+    for run in [*small("known-reward", tasks=("jaco-reach_top_left",)), *small("zero-shot")]:
+        assert run.start.env == run.env
+    assert small("known-reward", tasks=("jaco-reach_top_left",))[0].env == "urlb/jaco-reach_top_left-fixed-v0"
+    assert small("modules")[0].start.env == "urlb/walker-stand-v0"
+
+
+def test_unknown_tasks_and_empty_studies_are_refused():
+    with pytest.raises(ValueError, match="Unknown task 'walker-dance'"):
+        Plan(tasks=("walker-dance",))
+    with pytest.raises(ValueError, match="is about Jaco"):
+        small("sparsity")
+    with pytest.raises(ValueError, match="positive numbers"):
+        Plan(seeds=0)
+    with pytest.raises(ValueError, match="Unknown study 'none'"):
+        runs_of("none", Plan())
+
+
+def test_what_is_missing_is_done_once(tmp_path):
+    study, runs = folder(tmp_path), small("longer")
+    assert [run.length for run in study.missing(runs)] == [40, 56]
+    assert study.work(runs, at_most=1) == 1 and len(study.missing(runs)) == 1
+    before = study.snapshot(runs[0].start, 56).read_bytes()
+    # Another process, later.
+    again = folder(tmp_path)
+    assert again.work(runs) == 1 and again.work(runs) == 0 and again.missing(runs) == []
+    assert study.snapshot(runs[0].start, 56).read_bytes() == before
+    assert [path for path in (tmp_path / "runs").iterdir() if path.is_dir()] == []
+    with pytest.raises(ValueError, match="other lengths need another folder"):
+        study.work(small("longer", pretrain=(48, 56)))
+    rows = read_rows(study.rows).rows
+    # Snapshots may come a step late.
+    assert [(row.pretrain_frames, row.finetune_frames, row.keep_actor) for row in rows] == [(40, 48, True), (56, 48, True)]
+
+
+def test_zero_shot_and_modules_share_nothing_but_the_folder(tmp_path):
+    study = folder(tmp_path)
+    runs = small("zero-shot", methods=("icm",), pretrain=(56,))
+    assert study.work(runs) == 2
+    rows = {row.finetune_frames: row for row in read_rows(study.rows).rows}
+    assert {frames: row.planner for frames, row in rows.items()} == {0: "mppi_zero_shot", 48: "mppi_zero_shot"}
+    assert all(row["known_reward"] == "true" for row in rows.values())
+    critic = [run for run in small("modules", pretrain=(56,)) if run.keep_critic and run.planner is None]
+    assert study.work(critic) == 1
+    row = next(row for row in read_rows(study.rows).rows if row.keep_critic)
+    assert (row.method, row.keep_actor, row.planner) == ("lbs", True, "none")
+
+
+def test_the_command_lists(tmp_path, capsys):
+    options = ["--folder", str(tmp_path), "--methods", "lbs", "--tasks", "walker-run", "--seeds", "1"]
+    assert main(["study", "modules", "list", *options]) == 0
+    out = capsys.readouterr().out
+    assert out.count("missing lbs-walker-stand-0-2000000/2000000/walker-run/model") == 6 and "0 of 6 done" in out
+    assert main(["study", "modules", "list", *options[:2], "--methods", "nobody"]) == 2
+    assert "nobody" in capsys.readouterr().err
+
+
+def test_a_run_that_is_cut_off_goes_on(tmp_path, monkeypatch):
+    """The evaluation fails after fine-tuning: another process does not begin anew."""
+    from sb3_dreamer_urlb import DreamerV2
+    from sb3_dreamer_urlb.analysis import study as module
+
+    study, runs = folder(tmp_path), small("longer", pretrain=(56,))
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "run_evaluation", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            study.work(runs)
+    assert study.missing(runs) == runs
+    updates = []
+    train = DreamerV2.train
+    monkeypatch.setattr(DreamerV2, "train", lambda self, *a, **k: (updates.append(1), train(self, *a, **k)))
+    assert folder(tmp_path).work(runs) == 1 and updates == []
