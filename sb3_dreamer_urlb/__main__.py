@@ -13,7 +13,18 @@ from typing import Any
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
-MODULES = ("compare", "discrepancy", "evaluate", "figures", "oracle_reward", "report", "study", "tasks", "zero_shot")
+MODULES = (
+    "compare",
+    "discrepancy",
+    "evaluate",
+    "figures",
+    "keep_actor",
+    "oracle_reward",
+    "report",
+    "study",
+    "tasks",
+    "zero_shot",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,48 @@
+"""Measure whether fine-tuning should keep the pre-trained actor: it and a fresh one play a few episodes of the task."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+HELP = "measure whether fine-tuning should keep the pre-trained actor"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: of this command
+    """
+    parser.add_argument("snapshot", type=Path, help="pre-trained")
+    parser.add_argument("--env", required=True, help="id of the task's environment, such as urlb/walker-run-v0")
+    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
+    parser.add_argument("--episodes", type=int, default=5, help="with each actor (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=3000, help="of the first episode (default: %(default)s)")
+    parser.add_argument("--device", default="auto", help="(default: %(default)s)")
+
+
+def run(options: dict[str, Any]) -> int:
+    """
+    :param options: of the command line
+    :return: exit status
+    :raises ValueError: for a snapshot without an actor to keep
+    :raises FileNotFoundError: if there is no snapshot
+    """
+    import numpy as np
+
+    from sb3_dreamer_urlb.analysis.task_aware import try_actor
+    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.number_checks import check_integer
+    from sb3_dreamer_urlb.phases import keeps_actor
+
+    check_integer("--episodes", options["episodes"], 1)
+    model, env = load_agent(options, min(options["episodes"], 10))
+    try:
+        trial = try_actor(model, env, options["episodes"], options["seed"])
+    finally:
+        env.close()
+    for name, returns in (("pre-trained", trial.pretrained), ("fresh", trial.fresh)):
+        print(f"  {name} actor: return {np.mean(returns):.1f} ± {np.std(returns):.1f} ({len(returns)} episodes)")
+    rule = "keep" if keeps_actor(model.domain) else "drop"
+    print(f"{'keep' if trial.keep else 'drop'} the actor, after {trial.frames} frames; the paper's rule by domains: {rule}")
+    return 0
