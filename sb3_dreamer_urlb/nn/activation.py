@@ -74,6 +74,9 @@ def _learns(x: th.Tensor) -> bool:
 
 def _cheaper(x: th.Tensor) -> bool:
     """Whether to compute it here. The numbers must lie in memory one after the other, in whatever order."""
+    if th.jit.is_tracing() or th.compiler.is_exporting():  # type: ignore[attr-defined, no-untyped-call]
+        # What is written down runs elsewhere, on other sizes.
+        return False
     smallest = SMALLEST
     if native.active():
         smallest = SMALLEST_NATIVE_LEARNING if _learns(x) else SMALLEST_NATIVE

@@ -108,10 +108,20 @@ class RSSM(nn.Module):
         :param is_first: bool (n,), true where an episode begins: state and action are zeroed there
         :param generator: source of randomness
         """
+        logits, deter = self.posterior(state, action, embed, is_first)
+        return LatentState(self._sample(logits, generator), deter)
+
+    def posterior(
+        self, state: LatentState, action: th.Tensor, embed: th.Tensor, is_first: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """What :meth:`posterior_step` draws from, whose parameters it takes.
+
+        :return: posterior logits, float (n, S, K), and the next deterministic state, float (n, D)
+        """
         keep = (~is_first).to(embed.dtype).unsqueeze(-1)
         deter = self._recur(state.masked(keep), self._action_part(action * keep))
         deter_weight = self.post_hidden.weight[:, : self.deter_size]
-        return LatentState(self._sample(self._posterior(deter, self._embed_part(embed), deter_weight), generator), deter)
+        return self._posterior(deter, self._embed_part(embed), deter_weight), deter
 
     def observe(self, embed: th.Tensor, action: th.Tensor, is_first: th.Tensor) -> tuple[LatentState, th.Tensor, th.Tensor]:
         """Infer the states of replayed sequences.
