@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.number_checks import check_integer
@@ -174,7 +175,7 @@ def check_fits(model: DreamerV2, trajectories: Sequence[Trajectory]) -> None:
     """
     if not trajectories:
         raise ValueError("No trajectories are given.")
-    seen, other = _shapes(model.observation_space.sample()), [_shapes(one.observations, 1) for one in trajectories]
+    seen, other = _shapes(model.observation_space), [_shapes(one.observations) for one in trajectories]
     acted = [one.actions.shape[1:] for one in trajectories]
     if any(one != seen for one in other):
         raise ValueError(f"The model sees {seen}, the trajectories hold {next(one for one in other if one != seen)}.")
@@ -182,10 +183,11 @@ def check_fits(model: DreamerV2, trajectories: Sequence[Trajectory]) -> None:
         raise ValueError(f"The model's actions are {model.action_space}, those of the trajectories have the shape {acted[0]}.")
 
 
-def _shapes(observation: Any, skip: int = 0) -> Any:
-    if isinstance(observation, dict):
-        return {name: np.shape(part)[skip:] for name, part in sorted(observation.items())}
-    return np.shape(observation)[skip:]
+def _shapes(seen: Any) -> Any:
+    """Of one observation, by a space or by observations one after the other."""
+    if isinstance(seen, dict | spaces.Dict):
+        return {name: _shapes(part) for name, part in sorted(seen.items())}
+    return seen.shape if isinstance(seen, spaces.Space) else np.shape(seen)[1:]
 
 
 def as_batch(policy: DreamerPolicy, trajectory: Trajectory) -> SequenceBatch:

@@ -9,6 +9,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 from counter_task import ENV, STEPS
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_dreamer_urlb import DreamerV2
@@ -106,7 +107,14 @@ def test_models_that_cannot_be_compared(snapshots, tuned, trajectories):
     other_decoder = DreamerV2("CnnPolicy", make_vec_env(ENV, 1), preset="tiny", device="cpu", seed=4)
     elsewhere = DreamerV2.load(snapshots(), device="cpu")
     elsewhere.domain = "jaco"
-    for before, said in ((larger, "different sizes"), (other_decoder, "freeze_decoder=True"), (elsewhere, "differ in domain")):
+    stronger = DreamerV2.load(snapshots(), device="cpu")
+    stronger.action_space = spaces.Box(-2, 2, (2,), np.float32)
+    for before, said in (
+        (larger, "different sizes"),
+        (other_decoder, "freeze_decoder=True"),
+        (elsewhere, "differ in domain"),
+        (stronger, "differ in action_space"),
+    ):
         with pytest.raises(ValueError, match=said):
             latent_dynamics_discrepancy(before, after, trajectories)
 
