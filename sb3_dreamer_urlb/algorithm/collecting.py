@@ -120,8 +120,10 @@ class CollectingAlgorithm(SavingAlgorithm):
             self._on_step()
             ended = int(dones.sum())
             num_collected_episodes += ended
-            if log_interval is not None and self._episode_num % log_interval < ended:
-                self.dump_logs()
+            for episode in range(self._episode_num - ended + 1, self._episode_num + 1):
+                # As SB3: a line for each, although several may end with one step.
+                if log_interval is not None and episode % log_interval == 0:
+                    self.dump_logs()
         if continue_training:
             callback.on_rollout_end()
         return RolloutReturn(num_collected_steps * env.num_envs, num_collected_episodes, continue_training)
