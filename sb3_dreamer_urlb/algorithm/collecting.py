@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb.algorithm import standing
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
@@ -189,6 +190,7 @@ class CollectingAlgorithm(SavingAlgorithm):
         # Environments may write the next observation into the same arrays.
         self._last_obs, self._last_original_obs = copy.deepcopy(new_obs), copy.deepcopy(original_obs)
         self._last_episode_starts = dones.astype(bool)
+        self._leave_standing()
 
     # -- episodes ------------------------------------------------------------------------------------------------------
 
@@ -206,8 +208,18 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._touches = last_touches(self.env)
         # Environments may write the next observation into the same arrays.
         self._last_obs = copy.deepcopy(self._last_obs)
+        self._leave_standing()
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._last_obs)
+
+    def _leave_standing(self) -> None:
+        assert self.env is not None and self._last_episode_starts is not None
+        standing.leave(self.env, self._touches, self._last_obs, self._last_episode_starts)
+
+    def go_on_where_left(self) -> None:
+        """Begin without a reset, if a model left the environments where they stand now."""
+        if self.env is not None and (left := standing.found(self.env)) is not None:
+            self._touches, self._last_obs, self._last_episode_starts = left.touches, left.observation, left.starts
 
     def _keeps_what_was_seen(self) -> bool:
         """Whether the replay holds normalised observations, because a wrapper outside of VecNormalize changed them further."""

@@ -25,6 +25,10 @@ class SavingAlgorithm(RunningAlgorithm):
     """Stable-Baselines3's ``save``, ``load`` and their kin, with files that can never run code."""
 
     @abstractmethod
+    def go_on_where_left(self) -> None:
+        """Begin without a reset, if a model left the environments where they stand now."""
+
+    @abstractmethod
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
         """An empty one for the current phase."""
 
@@ -62,13 +66,17 @@ class SavingAlgorithm(RunningAlgorithm):
         :param custom_objects: arguments that replace the stored ones, needed for those that no file can hold: functions as
             learning rates, classes that are not registered; unknown names are ignored, as SB3 does
         :param print_system_info: print those of the file and of this machine
-        :param force_reset: part of SB3's interface; the environment is always reset
+        :param force_reset: False goes on in the middle of episodes, with ``learn(..., reset_num_timesteps=False)``: if ``env``
+            is that of a model that learnt in it in this process and nobody has stepped or reset it since; else it is reset
         :param kwargs: constructor arguments to change; a new ``seed`` also draws anew
         :raises TypeError: for a keyword that is no constructor argument
         :raises SnapshotError: naming the file and why it is refused
         """
         check_load_keywords(cls, kwargs)
-        return model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
+        model = model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
+        if not force_reset:
+            model.go_on_where_left()
+        return model
 
     @classmethod
     def resume(

@@ -9,6 +9,7 @@ import pickle
 import numpy as np
 import pytest
 from fake_envs import CounterEnv, counter
+from gymnasium import spaces
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -204,14 +205,14 @@ class Streams(RuleBasedStateMachine):
     def set_env(self, same, force_reset):
         self.model.set_env(self.model.get_env() if same else self.new_env(), force_reset=force_reset)
 
-    @rule(same=st.booleans())
-    def save_and_load(self, same):
+    @rule(same=st.booleans(), force_reset=st.booleans())
+    def save_and_load(self, same, force_reset):
         model, replay = io.BytesIO(), io.BytesIO()
         self.model.save(model)
         self.model.save_replay_buffer(replay)
         model.seek(0), replay.seek(0)
         env = self.model.get_env() if same else self.new_env()
-        self.model = DreamerV2.load(model, env, device="cpu")
+        self.model = DreamerV2.load(model, env, device="cpu", force_reset=force_reset)
         self.model.load_replay_buffer(replay)
 
     @rule()
@@ -263,6 +264,53 @@ def test_nothing_touched_means_no_reset(tiny_model):
     for _ in range(4):
         model.learn(4, reset_num_timesteps=False)
     assert env.told.count(None) == 3
+
+
+@pytest.mark.parametrize("given", ["model's", "inner"])
+def test_a_loaded_model_goes_on_where_the_environment_stands(tiny_model, tmp_path, given):
+    env = TellingEnv()
+    model = tiny_model(env, replay_buffer_kwargs={"sampling": "rows"}).learn(4)
+    model.save(tmp_path / "model")
+    where = model.get_env() if given == "model's" else model.get_env().unwrapped
+    loaded = DreamerV2.load(tmp_path / "model", where, device="cpu", force_reset=False)
+    assert np.array_equal(loaded._last_obs, model._last_obs) and not loaded._last_episode_starts.any()
+    loaded.learn(8, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 12 and env.told.count(None) == 3
+    # An episode has 6 steps, then 3: what the first model saw of the first is not in the second one's replay.
+    assert counter(loaded.replay_buffer.episodes[0].observation).tolist() == [4, 5, 6]
+    check_streams(loaded, [env])
+
+
+@pytest.mark.parametrize("case", ["force_reset", "touched", "another", "other wrappers", "never used"])
+def test_without_a_true_note_the_environment_is_reset(tiny_model, tmp_path, case):
+    model = tiny_model(TellingEnv())
+    if case != "never used":
+        model.learn(4)
+    model.save(tmp_path / "model")
+    env = model.get_env()
+    if case == "touched":
+        env.reset()
+    elif case == "another":
+        env = DummyVecEnv([TellingEnv])
+    elif case == "other wrappers":
+        env = VecNormalize(env, norm_obs=False)
+    loaded = DreamerV2.load(tmp_path / "model", env, device="cpu", force_reset=case == "force_reset")
+    assert loaded._last_obs is None
+    assert loaded.learn(4, reset_num_timesteps=False).num_timesteps == (4 if case == "never used" else 8)
+
+
+def test_normalised_observations_go_on(tiny_model, tmp_path):
+    space = spaces.Box(-1, 1, (3,), np.float32)
+    env = VecNormalize(DummyVecEnv([lambda: CounterEnv(6, observation_space=space)]))
+    model = tiny_model(env, "MlpPolicy", replay_buffer_kwargs={"sampling": "rows"}).learn(4)
+    model.save(tmp_path / "model")
+    loaded = DreamerV2.load(tmp_path / "model", env, device="cpu", force_reset=False)
+    original = model._last_original_obs
+    assert env.unwrapped.envs[0].unwrapped.resets == 1
+    loaded.learn(4, reset_num_timesteps=False)
+    assert env.unwrapped.envs[0].unwrapped.resets == 2
+    [episode, *_] = loaded.replay_buffer.episodes
+    assert np.array_equal(episode.observation[0], original[0])
 
 
 @pytest.mark.parametrize("guarded", [False, True])
