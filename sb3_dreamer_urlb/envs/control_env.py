@@ -2,7 +2,9 @@
 
 One class, from the action to the observation, in place of a stack of wrappers: rescale the action, hold it for some control
 steps, sum their rewards, observe once. How it observes is a subclass's affair: ``pixel_env`` through a camera, ``state_env``
-by dm_control's own numbers. The physics steps the same for all of them.
+by dm_control's own numbers. The physics steps the same for all of them. Shimmy stands between it and dm_control and does the
+seeding and the translation of dm_control's time steps. Importing Shimmy imports GLFW, whose library opens no other library
+before a window is wanted: states need no OpenGL.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -26,14 +28,19 @@ load_physics()
 
 from dm_control import composer  # noqa: E402 - without OpenGL, see load_physics
 from dm_control.rl import control  # noqa: E402
+from shimmy.dm_control_compatibility import DmControlCompatibilityV0  # noqa: E402 - imports dm_control
 
 if TYPE_CHECKING:
-    import dm_env
-
     from sb3_dreamer_urlb.envs.perturbed_control import PerturbedControl
 
 _FAST_SHADOW_MAP = 512  # texels a side; dm_control's own is 2048, composer's 4096
 _UNLIMITED = 1e10  # what dm_control gives as the bound of an actuator that has none (mjMAXVAL)
+
+
+class ShimmyEnv(DmControlCompatibilityV0):
+    """Shimmy's environment. It writes ``render_fps`` into its class's ``metadata``: give it a dict of its own to spoil."""
+
+    metadata: ClassVar[dict[str, Any]] = dict(DmControlCompatibilityV0.metadata)
 
 
 class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
@@ -46,7 +53,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
     ``reset(seed=s)`` seeds everything the task draws; without a seed its stream goes on (a fresh one starts from the
     system's entropy). It does not seed ``action_space``.
 
-    :param control_env: a bare environment of dm_control's suite or composer
+    :param control_env: a bare environment of dm_control's suite or composer (Shimmy cannot seed a wrapped composer one)
     :param options: how it is shown
     :param domain: kept as ``domain``
     :param task: kept as ``task``
@@ -79,9 +86,10 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
 
         self._options = options
         self._control = control_env
+        self._check_camera(options.camera)
+        self._shimmy = ShimmyEnv(control_env)
         #: what steps it in place of itself, if it is perturbed: see ``perturbed_control``
         self.perturbed: PerturbedControl | None = None
-        self._check_camera(options.camera)
         self._was_reset, self._episode_over, self._closed = False, True, False
 
         spec = control_env.action_spec()
@@ -95,11 +103,19 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         """What :meth:`_observe` returns."""
 
     @abstractmethod
-    def _observe(self, time_step: dm_env.TimeStep) -> Any:
+    def _observe(self, observed: dict[str, Any]) -> Any:
         """The present state as the agent sees it, in new arrays.
 
-        :param time_step: dm_control's last
+        :param observed: dm_control's own observation, an array a part
         """
+
+    def perturb(self, perturbed: PerturbedControl) -> None:
+        """Step through this one from now on.
+
+        :param perturbed: stands around the same bare environment
+        """
+        self.perturbed = perturbed
+        self._shimmy = ShimmyEnv(perturbed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
@@ -112,13 +128,13 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         if self._closed:
             raise ClosedEnvironmentError(f"{self} was closed: make a new one.")
         super().reset(seed=seed)
-        if seed is not None:
-            self._seed_task(seed)
+        if seed is not None and self.perturbed is not None:
+            self.perturbed.seed(seed)
         with self._named_physics_errors():
-            time_step = (self.perturbed or self._control).reset()
+            observed, _ = self._shimmy.reset(seed=seed)
         self._prepare_renderer()
         self._was_reset, self._episode_over = True, False
-        return self._observe(time_step), {}
+        return self._observe(observed), {}
 
     def step(self, action: npt.NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Hold an action for ``action_repeat`` control steps, or until the episode ends.
@@ -135,15 +151,13 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         task_reward, terminated, truncated = 0.0, False, False
         for _ in range(self.action_repeat):
             with self._named_physics_errors():
-                time_step = (self.perturbed or self._control).step(control_action)
-            task_reward += float(time_step.reward or 0.0)
-            if time_step.last():
-                # dm_control's time limits leave the discount at 1: the state goes on, only the episode does not.
-                terminated = bool(time_step.discount == 0)
-                truncated = not terminated
+                # dm_control's time limits leave the discount at 1: Shimmy calls that truncated.
+                observed, reward, terminated, truncated, _ = self._shimmy.step(control_action)
+            task_reward += float(reward)
+            if terminated or truncated:
                 self._episode_over = True
                 break
-        observation = self._observe(time_step)
+        observation = self._observe(observed)
         reward = 0.0 if self._options.reward_free else task_reward
         return observation, reward, terminated, truncated, {"task_reward": task_reward}
 
@@ -163,25 +177,11 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         """Free the simulation and its OpenGL context. May be called again."""
         if not self._closed:
             self._closed = self._episode_over = True
-            self._control.physics.free()
-            self._control.close()
+            self._shimmy.close()
 
     def __str__(self) -> str:
         registered = f" ({self.spec.id})" if self.spec else ""
         return f"<{type(self).__name__} {self.domain}-{self.task}{registered}>"
-
-    def _seed_task(self, seed: int) -> None:
-        """Give everything that the task draws a stream of its own; dm_control keeps it in private attributes only.
-
-        :param seed: 0 to 2**32 - 1
-        """
-        stream = np.random.RandomState(seed)
-        if isinstance(self._control, composer.Environment):
-            self._control._random_state = stream
-        else:
-            self._control.task._random = stream
-        if self.perturbed is not None:
-            self.perturbed.seed(seed)
 
     def _to_control(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """From [-1, 1] to the task's own bounds; a value outside ends outside, and MuJoCo clamps it.

@@ -46,4 +46,4 @@ def perturb(env: ControlEnv, perturbations: Perturbations) -> None:
         raise ValueError(f"{env} is perturbed already, by {env.perturbed.perturbations}")
     if perturbations.limb(env.domain) is not None and env.domain == "quadruped" and env.task not in QUADRUPED_ARENAS:
         raise ValueError(f"{LIMBS[env.domain]}: {env.domain} has it in {', '.join(QUADRUPED_ARENAS)}, not {env.task}")
-    env.perturbed = PerturbedControl(env._control, perturbations, env.domain, env.task)
+    env.perturb(PerturbedControl(env._control, perturbations, env.domain, env.task))

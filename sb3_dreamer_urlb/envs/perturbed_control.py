@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import deque
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
+import dm_env
 import numpy as np
 import numpy.typing as npt
 
@@ -21,9 +22,6 @@ load_physics()
 from dm_control import composer
 from dm_control.rl import control
 from dm_control.suite import common, quadruped
-
-if TYPE_CHECKING:
-    import dm_env
 
 Item = TypeVar("Item")
 
@@ -57,7 +55,7 @@ class Delay(Generic[Item]):
         return self._waiting.popleft()
 
 
-class PerturbedControl:
+class PerturbedControl(dm_env.Environment):
     """Steps a dm_control environment as :class:`~sb3_dreamer_urlb.envs.perturbations.Perturbations` say.
 
     In a control step an action is first delayed, then noise is added and the result clipped to the task's bounds, then it is
@@ -112,6 +110,43 @@ class PerturbedControl:
         if self.perturbations.reward_delay:
             time_step = time_step._replace(reward=self._rewards(time_step.reward))
         return time_step
+
+    def observation_spec(self) -> Any:
+        return self._control.observation_spec()
+
+    def action_spec(self) -> Any:
+        return self._control.action_spec()
+
+    def control_timestep(self) -> float:
+        return float(self._control.control_timestep())
+
+    def close(self) -> None:
+        self._control.close()
+
+    @property
+    def physics(self) -> Any:
+        """The bare environment's; another after a reset that stretches limbs."""
+        return self._control.physics
+
+    # Where Shimmy looks for what it wraps and for the task's stream: the suite's in the task, composer's in the environment.
+
+    @property
+    def _env(self) -> Any:
+        return self._control
+
+    @property
+    def task(self) -> Any:
+        """The bare environment's."""
+        return self._control.task
+
+    @property
+    def _random_state(self) -> np.random.RandomState:
+        stream: np.random.RandomState = self._control._random_state
+        return stream
+
+    @_random_state.setter
+    def _random_state(self, stream: np.random.RandomState) -> None:
+        self._control._random_state = stream
 
     def _clear(self) -> None:
         self._actions.clear()

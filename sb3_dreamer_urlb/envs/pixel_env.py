@@ -20,7 +20,7 @@ class PixelControlEnv(ControlEnv):
     def _space(self) -> spaces.Box:
         return image_space(self._options)
 
-    def _observe(self, time_step: Any) -> npt.NDArray[np.uint8]:
+    def _observe(self, observed: dict[str, Any]) -> npt.NDArray[np.uint8]:
         return self._picture(self._options.image_size)
 
 

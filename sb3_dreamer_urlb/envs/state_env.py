@@ -39,11 +39,11 @@ class StateControlEnv(ControlEnv):
             raise ValueError(f"observation='state': {self.domain}-{self.task} observes nothing but pictures")
         return spaces.Box(-STATE_BOUND, STATE_BOUND, (size,), np.float32)
 
-    def _observe(self, time_step: Any) -> Any:
-        return self._state(time_step)
+    def _observe(self, observed: dict[str, Any]) -> Any:
+        return self._state(observed)
 
-    def _state(self, time_step: Any) -> npt.NDArray[np.float32]:
-        parts = [np.ravel(time_step.observation[name]) for name, _ in self.state_parts]
+    def _state(self, observed: dict[str, Any]) -> npt.NDArray[np.float32]:
+        parts = [np.ravel(observed[name]) for name, _ in self.state_parts]
         return np.concatenate(parts).astype(np.float32)
 
 
@@ -55,5 +55,5 @@ class PixelAndStateControlEnv(StateControlEnv):
     def _space(self) -> spaces.Dict:
         return spaces.Dict({"image": image_space(self._options), "state": super()._space()})
 
-    def _observe(self, time_step: Any) -> dict[str, npt.NDArray[Any]]:
-        return {"image": self._picture(self._options.image_size), "state": self._state(time_step)}
+    def _observe(self, observed: dict[str, Any]) -> dict[str, npt.NDArray[Any]]:
+        return {"image": self._picture(self._options.image_size), "state": self._state(observed)}

@@ -108,10 +108,14 @@ def test_spaces_and_attributes():
 
 
 def test_frame_rates_are_true_and_shared_with_nobody():
+    from shimmy.dm_control_compatibility import DmControlCompatibilityV0
+
+    before = dict(DmControlCompatibilityV0.metadata)
     walker, quadruped = make_urlb_env("walker", "walk"), make_urlb_env("quadruped", "walk", action_repeat=1)
     assert walker.metadata["render_fps"] == pytest.approx(1 / (0.025 * 2))
     assert quadruped.metadata["render_fps"] == pytest.approx(1 / 0.02)
     assert "render_fps" not in type(walker).metadata
+    assert before == DmControlCompatibilityV0.metadata
 
 
 @pytest.mark.parametrize(
