@@ -556,10 +556,21 @@ def test_a_preset_replaces_defaults(preset):
         pytest.skip("its networks are large; its defaults are checked above")
     model = DreamerV2("CnnPolicy", CounterEnv(), preset=preset, device="cpu")
     for name, value in PRESETS[preset].items():
-        assert getattr(model, name) == value or name == "train_freq", name
+        # The preset proposes an entropy bonus: what counts is what the phase makes of it.
+        found = model.learner.config.ent_coef if name == "ent_coef" else getattr(model, name)
+        assert found == value or name == "train_freq", name
     assert model.train_freq.frequency == PRESETS[preset]["train_freq"]
     assert model.policy.agent.world_model.rssm.deter_size == PRESETS[preset]["policy_kwargs"]["deter_size"]
     assert model.gamma == 0.99  # not named by any preset
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_diayn_keeps_its_own_entropy_bonus_under_every_preset(preset, tiny_model, monkeypatch):
+    proposed = {name: value for name, value in PRESETS[preset].items() if name == "ent_coef"}
+    monkeypatch.setitem(PRESETS, preset, {**PRESETS["tiny"], **proposed})
+    assert tiny_model(preset=preset, intrinsic_reward="diayn").learner.config.ent_coef == 0.1
+    assert tiny_model(preset=preset, intrinsic_reward="lbs").learner.config.ent_coef == proposed.get("ent_coef", 0)
+    assert tiny_model(preset=preset, intrinsic_reward="diayn", ent_coef=0.01).learner.config.ent_coef == 0.01
 
 
 def test_what_is_written_out_wins_over_the_preset(tiny_model):
