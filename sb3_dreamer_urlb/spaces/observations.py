@@ -76,7 +76,7 @@ class Images(Observations):
         channels, height, width = space.shape
         if not (least <= height <= most and least <= width <= most):
             raise UnsupportedSpaceError(
-                f"Images must be {least} to {most} pixels high and wide, channels first, got {height}×{width} in {space}."
+                f"Images must be {least} to {most} pixels high and wide, got {height}×{width} in {space} (channels first)."
             )
         self.shape = (channels, height, width)
         self.low, self.range = low, high - low

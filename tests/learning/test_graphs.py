@@ -27,7 +27,7 @@ from sb3_dreamer_urlb.dreamer_v2 import policies
 from sb3_dreamer_urlb.intrinsic import LBS
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
 from sb3_dreamer_urlb.learning import graphs
-from sb3_dreamer_urlb.learning import learner as learner_module
+from sb3_dreamer_urlb.learning import base
 from sb3_dreamer_urlb.learning.graphs import WARM_UPS, Recorder
 from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
@@ -43,7 +43,7 @@ def taped(monkeypatch):
     def make(compile, device):
         return TapeBackend() if compile == "cuda_graphs" else None
 
-    for module in (learner_module, policies):
+    for module in (base, policies):
         monkeypatch.setattr(module, "make_backend", make)
     # What plans on CUDA; a CPU's own form keeps weights where no tape can follow.
     monkeypatch.setattr(policies, "planned", PlannedAgent)
@@ -188,7 +188,7 @@ def test_recorded_actions_are_the_same(tiny_model, taped, case, deterministic):
     for ours, theirs in zip(found, expected, strict=True):
         assert all(np.array_equal(one, other) for one, other in zip(ours, theirs, strict=True))
     observing, choosing = recorded.policy._recorded()
-    assert observing.recordings == (case != "skills" or not deterministic)
+    assert observing.recordings == 1
     assert choosing.recordings == (case != "random")
 
 
