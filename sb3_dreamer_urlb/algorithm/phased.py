@@ -28,8 +28,10 @@ from sb3_dreamer_urlb.types import MetricMeans
 
 
 @functools.cache
-def _argument_names(algorithm: type[PhasedAlgorithm]) -> frozenset[str]:
-    return frozenset(algorithm.argument_names())
+def _watched_arguments(algorithm: type[PhasedAlgorithm]) -> frozenset[str]:
+    """The arguments of the class that says which of them may be assigned; what subclasses add is their own affair."""
+    owner = next(kind for kind in algorithm.__mro__ if "assignable" in vars(kind))
+    return frozenset(owner.argument_names())  # type: ignore[attr-defined]
 
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
@@ -109,7 +111,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :raises AttributeError: for an argument that networks or replay were built with
         :raises ValueError: for a value that does not fit; the old one stays
         """
-        if self.assignable is None or "policy" not in vars(self) or name not in _argument_names(type(self)):
+        if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
             super().__setattr__(name, value)
             return
         if name not in self.assignable:

@@ -26,8 +26,7 @@ from sb3_dreamer_urlb.agent import PlannedAgent
 from sb3_dreamer_urlb.dreamer_v2 import policies
 from sb3_dreamer_urlb.intrinsic import LBS
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
-from sb3_dreamer_urlb.learning import graphs
-from sb3_dreamer_urlb.learning import base
+from sb3_dreamer_urlb.learning import base, graphs
 from sb3_dreamer_urlb.learning.graphs import WARM_UPS, Recorder
 from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.snapshots import model as model_snapshot

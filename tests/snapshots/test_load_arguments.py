@@ -70,7 +70,8 @@ def test_only_what_no_file_can_hold_must_be_given_again():
         return 1.0
 
     model = new_model(intrinsic_reward=None, intrinsic_kwargs=None)
-    model.replay_buffer_kwargs = {**model.replay_buffer_kwargs, "judge": judge}
+    # Past the model, which takes no assignment of what its replay was built with.
+    vars(model)["replay_buffer_kwargs"] = {**model.replay_buffer_kwargs, "judge": judge}
     file = file_of(model.save)
     # The buffer of this package takes no such argument, a user's own might.
     with pytest.raises(ValueError, match=r"its replay_buffer_kwargs was .*judge"):

@@ -714,8 +714,8 @@ def test_replay_files(tiny_model, tmp_path, monkeypatch, member_bytes):
     monkeypatch.setattr(replay, "MEMBER_BYTES", member_bytes)
     model = tiny_model(CounterEnv([7, 2, 12])).learn(40)
     model.save_replay_buffer(tmp_path / "replay")
-    assert [file.name for file in tmp_path.iterdir()] == ["replay.pkl"]
-    assert (len(members(tmp_path / "replay.pkl")) > 5) == (member_bytes == 1)
+    assert [file.name for file in tmp_path.iterdir()] == ["replay.zip"]
+    assert (len(members(tmp_path / "replay.zip")) > 5) == (member_bytes == 1)
     other = tiny_model(CounterEnv([7, 2, 12]))
     with code_events() as events:
         other.load_replay_buffer(tmp_path / "replay")
