@@ -36,7 +36,7 @@ modules = [name for name in modules if name not in ("__init__", "supervisor", "w
 for module in modules:
     if os.fork() == 0:
         importlib.import_module("sb3_dreamer_urlb.envs." + module)
-        loaded = [name for name in sys.modules if name.split(".")[0] in ("OpenGL", "glfw")]
+        loaded = [name for name in sys.modules if name.split(".")[0] == "OpenGL"]  # Shimmy imports GLFW, which loads none
         assert not loaded and "MUJOCO_GL" not in os.environ, (module, loaded)
         backend = envs.load_renderer()
         import dm_control._render
