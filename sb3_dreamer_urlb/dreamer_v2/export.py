@@ -201,7 +201,7 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     :raises ImportError: without the extra ``export``
     """
     if missing := [name for name in ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
-        raise ImportError(f"Writing ONNX needs {' and '.join(missing)}: pip install 'sb3_dreamer_urlb[export]'.")
+        raise ImportError(f"Writing ONNX needs {' and '.join(missing)}: pip install '.[export]'.")
     example = step.example()
     batch = th.export.Dim("n")
     with th.no_grad(), warnings.catch_warnings():
