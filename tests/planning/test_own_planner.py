@@ -121,7 +121,7 @@ def test_what_no_file_can_hold_must_be_given_again(tiny_model, tmp_path, planner
 def test_a_file_whose_planner_is_not_registered_here_is_refused(tiny_model, tmp_path, planner, monkeypatch):
     tiny_model(planner=planner).save(tmp_path / "model")
     monkeypatch.delitem(registry._KINDS, "own")
-    with pytest.raises((SnapshotError, ValueError), match=r"Unknown planner 'own'; known are \['dyna_mpc', 'mppi'"):
+    with pytest.raises((SnapshotError, ValueError), match=r"Unknown planner 'own'; known are \[.*'dyna_mpc'.*'mppi'"):
         DreamerV2.load(tmp_path / "model")
 
 
