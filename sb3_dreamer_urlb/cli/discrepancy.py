@@ -29,7 +29,7 @@ def run(options: dict[str, Any]) -> int:
     """
     from sb3_dreamer_urlb.analysis.annotate import DISCREPANCY, about, annotate
     from sb3_dreamer_urlb.analysis.discrepancy import check_comparable, latent_dynamics_discrepancy
-    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.cli.agents import load_agent
 
     pretrained, other = load_agent({**options, "snapshot": options["pretrained"]}, 1)
     other.close()

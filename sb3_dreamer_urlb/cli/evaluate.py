@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+from sb3_dreamer_urlb.cli.agents import add_evaluation_arguments, environments_at_a_time, load_agent, pairs, typed
 
+if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 
 HELP = "evaluate a saved agent: episodes with fixed seeds, a row of a CSV file, evaluations.npz"
@@ -21,11 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     :param parser: of this command
     """
     parser.add_argument("snapshot", type=Path, help="what model.save wrote, or the folder of a run")
-    parser.add_argument("--env", required=True, help="id of the environment, such as urlb/walker-run-v0")
-    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
-    parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
-    parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+    add_evaluation_arguments(parser)
     choices = ("auto", "on", "off", BOTH)
     parser.add_argument("--planner", choices=choices, default="auto", help="who acts; both plays twice (default: %(default)s)")
     parser.add_argument("--stochastic", action="store_true", help="explore as in training")
@@ -48,12 +43,9 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.evaluation.agent_rows import results_of, row_of
     from sb3_dreamer_urlb.evaluation.append import append_row
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
-    from sb3_dreamer_urlb.number_checks import check_integer
 
-    check_integer("--episodes", options["episodes"], 1)
+    envs = environments_at_a_time(options)
     about = {"snapshot": options["snapshot"], **_columns(options.get("set", ()))}
-    envs = options.get("envs", min(options["episodes"], 10))
-    check_integer("--envs", envs, 1)
     model, env = load_agent(options, envs)
     if "rows" in options and model.seed is None and "seed" not in about:
         env.close()
@@ -78,57 +70,14 @@ def run(options: dict[str, Any]) -> int:
     return 0
 
 
-def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[Any, VecEnv]:
-    """A saved agent and an environment for it.
-
-    :param options: of the command line: ``snapshot``, ``env``, ``device``, and, if given, ``env_kwargs``, ``vec_normalize``
-    :param envs: how many environments
-    :param arguments: of the model, in place of those in the file
-    """
-    from stable_baselines3.common.env_util import make_vec_env
-
-    from sb3_dreamer_urlb.evaluation.loading import algorithm_of, normalized_as_saved
-    from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
-    from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
-
-    path = options["snapshot"]
-    path = path / SNAPSHOT if path.is_dir() else path
-    kwargs = {name: _typed(value) for name, value in _pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
-    env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
-    try:
-        statistics = options.get("vec_normalize")
-        env = normalized_as_saved(env, path) if statistics is None else load_vec_normalize(statistics, env)
-        return algorithm_of(path).load(path, env=env, device=options["device"], **arguments), env
-    except BaseException:
-        env.close()
-        raise
-
-
-def _pairs(option: str, texts: Any) -> dict[str, str]:
-    pairs = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise ValueError(f"{option}: expected NAME=VALUE, got {text!r}.")
-        pairs[name] = value
-    return pairs
-
-
 def _columns(texts: Any) -> dict[str, Any]:
     from sb3_dreamer_urlb.evaluation.rows import REQUIRED
 
-    columns = {name: _typed(text) if name in REQUIRED else text for name, text in _pairs("--set", texts).items()}
+    columns = {name: typed(text) if name in REQUIRED else text for name, text in pairs("--set", texts).items()}
     for name in columns.keys() & {"keep_actor", "keep_critic"}:
         if columns[name] is not None and not isinstance(columns[name], bool):
             raise ValueError(f"--set {name}: expected true, false or none, got {columns[name]!r}.")
     return columns
-
-
-def _typed(text: str) -> Any:
-    try:
-        return json.loads(text.lower() if text in ("True", "False") else text)
-    except ValueError:
-        return None if text.lower() == "none" else text
 
 
 def _print(options: dict[str, Any], played: Evaluation) -> None:

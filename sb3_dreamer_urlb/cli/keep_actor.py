@@ -31,7 +31,7 @@ def run(options: dict[str, Any]) -> int:
     import numpy as np
 
     from sb3_dreamer_urlb.analysis.task_aware import try_actor
-    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.cli.agents import load_agent
     from sb3_dreamer_urlb.number_checks import check_integer
     from sb3_dreamer_urlb.phases import keeps_actor
 

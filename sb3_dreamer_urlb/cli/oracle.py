@@ -31,7 +31,7 @@ def trajectories_of(options: dict[str, Any]) -> list[Trajectory]:
     :raises ValueError: if neither an oracle nor a folder is given, or too few episodes are there
     """
     from sb3_dreamer_urlb.analysis.trajectories import load_trajectories, play_trajectories, save_trajectories
-    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.cli.agents import load_agent
     from sb3_dreamer_urlb.number_checks import check_integer
 
     check_integer("--count", options["count"], 1)

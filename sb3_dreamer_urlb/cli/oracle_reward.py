@@ -28,7 +28,7 @@ def run(options: dict[str, Any]) -> int:
     """
     from sb3_dreamer_urlb.analysis.annotate import INTRINSIC_REWARD, about, annotate
     from sb3_dreamer_urlb.analysis.novelty import check_has_intrinsic_reward, intrinsic_reward_on
-    from sb3_dreamer_urlb.cli.evaluate import load_agent
+    from sb3_dreamer_urlb.cli.agents import load_agent
 
     model, env = load_agent(options, 1)
     try:

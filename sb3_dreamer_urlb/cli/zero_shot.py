@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.cli.agents import add_evaluation_arguments, environment_of, environments_at_a_time, load_agent
+
 HELP = "plan with a pre-trained model and a known reward, without fine-tuning and with it"
 
 
@@ -14,11 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     :param parser: of this command
     """
     parser.add_argument("snapshot", type=Path, help="pre-trained, in the environment of the task or with its reward")
-    parser.add_argument("--env", required=True, help="id of the environment, such as urlb/walker-run-v0")
-    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
-    parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
-    parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+    add_evaluation_arguments(parser)
     parser.add_argument(
         "--finetune-frames", type=int, default=0, help="then fine-tune so long, and evaluate again (paper: 100000)"
     )
@@ -36,18 +34,15 @@ def run(options: dict[str, Any]) -> int:
     :raises FileNotFoundError: if there is no snapshot
     """
     from sb3_dreamer_urlb.analysis.zero_shot import PLANNER, check_pretrained, prepare_zero_shot
-    from sb3_dreamer_urlb.cli.evaluate import load_agent
     from sb3_dreamer_urlb.evaluation.agent_rows import row_of
     from sb3_dreamer_urlb.evaluation.append import append_row
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
     from sb3_dreamer_urlb.number_checks import check_integer
 
-    check_integer("--episodes", options["episodes"], 1)
+    envs = environments_at_a_time(options)
     check_integer("--finetune-frames", options["finetune_frames"], 0)
     if options["finetune_frames"] == 0 and (options["freeze_decoder"] or "save" in options):
         raise ValueError("--freeze-decoder and --save need --finetune-frames.")
-    envs = options.get("envs", min(options["episodes"], 10))
-    check_integer("--envs", envs, 1)
     first, env = load_agent(options, envs)
     env.close()
     check_pretrained(first)
@@ -56,7 +51,7 @@ def run(options: dict[str, Any]) -> int:
     for frames in dict.fromkeys((0, options["finetune_frames"])):
         model, train_env = load_agent(options, 1, planner=PLANNER, freeze_decoder=options["freeze_decoder"])
         prepare_zero_shot(model, frames)
-        _, env = load_agent(options, envs)
+        env = environment_of(options, envs)
         played = run_evaluation(model, env, options["episodes"], options["seed"], "on")
         how = "fine_tuned" if frames else "zero_shot"
         print(f"{options['env']}, {how}: return {played.mean:.1f} ± {played.std:.1f} ({len(played.returns)} episodes)")

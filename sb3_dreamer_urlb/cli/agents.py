@@ -1,0 +1,108 @@
+"""What commands share that play a saved agent: their options, the agent, and environments for it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which environment, and what episodes.
+
+    :param parser: of a command
+    """
+    parser.add_argument("--env", required=True, help="id of the environment, such as urlb/walker-run-v0")
+    parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
+    parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
+    parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
+    parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+
+
+def environments_at_a_time(options: dict[str, Any]) -> int:
+    """How many environments to play the episodes in.
+
+    :param options: of the command line
+    :raises ValueError: for a number of episodes or environments that is not positive
+    """
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_integer("--episodes", options["episodes"], 1)
+    envs: int = options.get("envs", min(options["episodes"], 10))
+    check_integer("--envs", envs, 1)
+    return envs
+
+
+def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[Any, VecEnv]:
+    """A saved agent and an environment for it.
+
+    :param options: of the command line: ``snapshot``, ``env``, ``device``, and, if given, ``env_kwargs``, ``vec_normalize``
+    :param envs: how many environments
+    :param arguments: of the model, in place of those in the file
+    """
+    from sb3_dreamer_urlb.evaluation.loading import algorithm_of
+
+    path, env = _file(options["snapshot"]), environment_of(options, envs)
+    try:
+        return algorithm_of(path).load(path, env=env, device=options["device"], **arguments), env
+    except BaseException:
+        env.close()
+        raise
+
+
+def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
+    """An environment as a saved agent knows it, without the agent.
+
+    :param options: of the command line: ``snapshot``, ``env``, and, if given, ``env_kwargs``, ``vec_normalize``
+    :param envs: how many environments
+    """
+    from stable_baselines3.common.env_util import make_vec_env
+
+    from sb3_dreamer_urlb.evaluation.loading import normalized_as_saved
+    from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
+
+    kwargs = {name: typed(value) for name, value in pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
+    env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
+    try:
+        statistics = options.get("vec_normalize")
+        return (
+            normalized_as_saved(env, _file(options["snapshot"])) if statistics is None else load_vec_normalize(statistics, env)
+        )
+    except BaseException:
+        env.close()
+        raise
+
+
+def _file(snapshot: Path) -> Path:
+    """Of a run folder, its last checkpoint."""
+    from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
+
+    return snapshot / SNAPSHOT if snapshot.is_dir() else snapshot
+
+
+def pairs(option: str, texts: Any) -> dict[str, str]:
+    """Options of the form NAME=VALUE, by name.
+
+    :param option: for the message
+    :param texts: as they were given
+    :raises ValueError: for another form
+    """
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise ValueError(f"{option}: expected NAME=VALUE, got {text!r}.")
+        found[name] = value
+    return found
+
+
+def typed(text: str) -> Any:
+    """A value as it was meant: a number, true, false, none, JSON, or else the text itself."""
+    try:
+        return json.loads(text.lower() if text in ("True", "False") else text)
+    except ValueError:
+        return None if text.lower() == "none" else text
