@@ -188,7 +188,8 @@ class CollectingAlgorithm(SavingAlgorithm):
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
         # Environments may write the next observation into the same arrays.
-        self._last_obs, self._last_original_obs = copy.deepcopy(new_obs), copy.deepcopy(original_obs)
+        self._last_obs = copy.deepcopy(new_obs)
+        self._last_original_obs = self._last_obs if original_obs is new_obs else copy.deepcopy(original_obs)
         self._last_episode_starts = dones.astype(bool)
         self._leave_standing()
 
