@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import pytest
 import torch as th
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -24,3 +27,22 @@ class Calls(TorchDispatchMode):
 
 
 SYNCHRONISING = ["item", "cpu", "numpy", "tolist", "__bool__", "__float__", "__int__", "__index__", "__array__"]
+
+
+@contextmanager
+def never_waiting(what: str) -> Iterator[None]:
+    """A block in which asking a tensor for its value fails; that it does is tried first.
+
+    :param what: is done in it, for the message
+    """
+
+    def refuse(*_, **__):
+        raise AssertionError(f"{what} waited for the device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in SYNCHRONISING:
+            patch.setattr(th.Tensor, name, refuse)
+        for ask in (th.Tensor.item, bool):
+            with pytest.raises(AssertionError, match="waited"):
+                ask(th.ones(()))
+        yield
