@@ -126,7 +126,7 @@ def fitted(config: DemoConfig, env: gymnasium.Env, limit: float = LIMIT) -> Demo
 
     def at(share: float) -> DemoConfig:
         episodes = 1 if share < 1 and config.episodes == defaults["episodes"] else config.episodes
-        frames = {name: round(share * getattr(config, name), -2) for name in names}
+        frames = {name: 100 * round(share * getattr(config, name) / 100) for name in names}
         return dataclasses.replace(config, **frames, episodes=episodes)
 
     def seconds(share: float) -> float:

@@ -7,6 +7,7 @@ from fake_envs import CounterEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
 from sb3_dreamer_urlb.cli import demo, pace
 from sb3_dreamer_urlb.cli.demo import DemoConfig
 from sb3_dreamer_urlb.cli.pace import Amount, Pace
@@ -62,6 +63,13 @@ def test_a_slow_machine_takes_smaller_numbers_and_says_so(monkeypatch, capsys):
     assert "would take about 47 minutes" in printed and "will take about 25 minutes" in printed
     slowest = fitted(monkeypatch, config, 100.0)
     assert (slowest.pretrain_frames, slowest.finetune_frames) == (900, 3600)
+
+
+@pytest.mark.parametrize("update", [0.001, 0.9, 1.5, 100.0])
+def test_frames_stay_whole_numbers_that_callbacks_take(monkeypatch, tmp_path, update):
+    config = fitted(monkeypatch, DemoConfig(preset="tiny"), update)
+    assert all(type(number) is int for number in (config.pretrain_frames, config.finetune_frames))
+    SnapshotCallback(tmp_path, [config.pretrain_frames])
 
 
 def test_numbers_that_somebody_gave_stay(monkeypatch):
