@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.evaluation import recording
-from sb3_dreamer_urlb.evaluation.films import labelled_open_loop
+from sb3_dreamer_urlb.evaluation.films import labelled_agent, labelled_open_loop
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures, predict_open_loop
 from sb3_dreamer_urlb.number_checks import check_integer
@@ -33,8 +33,8 @@ MAX_FPS = 25
 class VideoCallback(BaseCallback):
     """Films for TensorBoard's *Images* tab, every so many steps: ``video/agent`` and ``video/open_loop``.
 
-    ``video/agent`` is the beginning of an episode in an environment of its own, with the planner if it is on.
-    ``video/open_loop`` is a part of the same episode in three panels: truth, model, error. The model sees the first
+    ``video/agent`` is the beginning of an episode in an environment of its own, with the planner if it is on. Both films
+    are enlarged and labelled. ``video/open_loop`` is a part of the same episode in three panels: truth, model, error. The model sees the first
     ``context`` observations, then only the actions. Vectors have no open-loop film; of a Dict, the first image is shown.
 
     Learning is not touched: training's random draws and environments stay as they are without this callback. A ``learn``
@@ -116,7 +116,7 @@ class VideoCallback(BaseCallback):
         devices = [model.device] if model.device.type == "cuda" else []
         with th.random.fork_rng(devices):
             played = recording.record(model, self._env(), self.video_length, self.deterministic)
-            self._put(AGENT, played.frames, played.fps)
+            self._put(AGENT, list(labelled_agent(np.stack(played.frames))), played.fps)
             kind = model.policy.observations
             dreams = hasattr(model.policy.agent, "world_model")
             if not dreams or not has_image(kind) or len(played.actions) < self.open_loop_start + self.context:

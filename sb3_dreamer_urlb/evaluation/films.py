@@ -16,6 +16,25 @@ def truth_model_error(truth: np.ndarray, model: np.ndarray) -> np.ndarray:
     return np.concatenate([truth, model, error.astype(np.uint8)], 2)
 
 
+def enlarged(frames: np.ndarray, side: int) -> np.ndarray:
+    """Each pixel several times, so that ``side`` pixels become :data:`LEAST_SIDE` or more."""
+    scale = max(1, -(-LEAST_SIDE // side))
+    return frames.repeat(scale, 1).repeat(scale, 2)
+
+
+def labelled_agent(frames: np.ndarray, start: int = 0) -> np.ndarray:
+    """An agent at work, enlarged by whole pixels, with what it is above and the step below.
+
+    :param frames: uint8 (n, height, width, 3)
+    :param start: step of the first frame
+    :return: uint8 (n, …, …, 3)
+    """
+    frames = enlarged(frames, frames.shape[2])
+    above = text_line(frames.shape[2], [("agent", 0)])
+    below = [text_line(frames.shape[2], [(f"step {start + i}", 0)]) for i in range(len(frames))]
+    return np.stack([np.concatenate([above, frame, line]) for frame, line in zip(frames, below, strict=True)])
+
+
 def labelled_open_loop(truth: np.ndarray, model: np.ndarray, context: int, start: int = 0) -> np.ndarray:
     """Truth, model and error, enlarged by whole pixels, with the panels' names above and the step below.
 
@@ -25,8 +44,7 @@ def labelled_open_loop(truth: np.ndarray, model: np.ndarray, context: int, start
     :param start: step of the first frame
     :return: uint8 (n, …, …, C)
     """
-    scale = max(1, -(-LEAST_SIDE // truth.shape[2]))
-    panels = truth_model_error(truth, model).repeat(scale, 1).repeat(scale, 2)
+    panels = enlarged(truth_model_error(truth, model), truth.shape[2])
     width = panels.shape[2] // 3
     names = [("truth", 0), ("model", width), ("error", 2 * width)]
     frames = []

@@ -62,8 +62,14 @@ def test_films_in_tensorboard_at_the_chosen_interval(tiny_model, tmp_path):
     }
     # The whole episode, as the environment draws it; then truth, model and error side by side.
     agent, open_loop = found["video/agent"][0][1], found["video/open_loop"][0][1]
-    assert agent.shape == (12, 32, 32, 3) and [int(frame[5, 5, 0]) for frame in agent[:3]] == [0, 3, 6]
-    assert open_loop.shape == (9, 12 * 16 + 2 * LINE, 12 * 48, 3)  # enlarged and labelled
+    assert agent.shape == (12, 6 * 32 + 2 * LINE, 6 * 32, 3)  # enlarged and labelled
+    drawn = agent[:, LINE:-LINE]
+    assert [int(frame[30, 30, 0]) for frame in drawn[:3]] == [0, 3, 6]
+    assert (drawn[:, ::6, ::6].repeat(6, 1).repeat(6, 2) == drawn).all()
+    # Both lines have text, and the lower one counts.
+    assert min(agent[:, :LINE].max(), agent[:, -LINE:].max()) > 200
+    assert (agent[0, :LINE] == agent[1, :LINE]).all() and (agent[0, -LINE:] != agent[1, -LINE:]).any()
+    assert open_loop.shape == (9, 12 * 16 + 2 * LINE, 12 * 48, 3)
 
 
 def test_the_open_loop_film_shows_truth_model_and_error(tiny_model, tmp_path):
@@ -139,7 +145,7 @@ def test_of_dicts_the_image_is_shown(tiny_model, tmp_path):
     model.learn(8, VideoCallback(env, video_freq=8, context=2, horizon=3))
     found = films(tmp_path)
     # Without a render mode the agent's own view is the film; one channel is shown as grey.
-    assert found["video/agent"][0][1].shape == (8, 16, 20, 3) and found["video/open_loop"][0][1].shape == (
+    assert found["video/agent"][0][1].shape == (8, 160 + 2 * LINE, 200, 3) and found["video/open_loop"][0][1].shape == (
         5,
         160 + 2 * LINE,
         600,
