@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         import rl_zoo3
         import rl_zoo3.utils
 
+        from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line, with_values_named
         from sb3_dreamer_urlb.zoo.registration import register
         from sb3_dreamer_urlb.zoo.resuming import with_runs
     except ModuleNotFoundError as error:
@@ -63,8 +64,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("No display: playing without a window (--no-render); record_video makes a film.")
         rest = [*rest, "--no-render"]
     sys.argv = [f"{parser.prog} {command}", *rest]
+    parse_args = with_runs(with_values_named(argparse.ArgumentParser.parse_args))
     with (
-        mock.patch.object(argparse.ArgumentParser, "parse_args", with_runs(argparse.ArgumentParser.parse_args)),
+        told_in_a_line(sys.argv[0]),
+        mock.patch.object(argparse.ArgumentParser, "parse_args", parse_args),
         mock.patch("rl_zoo3.utils.get_model_path", _that_says_what_there_is(rl_zoo3.utils.get_model_path, sys.argv[0])),
     ):
         runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
@@ -94,8 +97,6 @@ def _that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callabl
         try:
             return original(exp_id, folder, algo, *args, **kwargs)
         except (AssertionError, ValueError) as error:
-            if algo != "dreamerv2":
-                raise
             runs = sorted(path.name for path in Path(folder, algo).glob("*") if path.is_dir())
             there = (
                 f"runs in {Path(folder, algo)}: {', '.join(runs)}" if runs else f"no run in {Path(folder, algo)} (-f names it)"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
+import yaml
+
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -34,6 +36,26 @@ def resolve(conf: str) -> str:
     if not conf.endswith((".yml", ".py")) and _is_module(conf):
         return conf
     raise ValueError(f"-conf {conf}: no such file, Python module, or configuration of this package: {', '.join(names())}.")
+
+
+def check(conf: str, env_id: str) -> None:
+    """Whether a file of hyperparameters has the form of one.
+
+    :param conf: a file, or something else, which is not looked at
+    :param env_id: whose hyperparameters are wanted
+    :raises ValueError: naming what stands there instead
+    """
+    if not conf.endswith((".yml", ".yaml")):
+        return
+    try:
+        found = yaml.safe_load(Path(conf).read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{conf} is not YAML: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{conf}: expected hyperparameters by environment, got {found!r}.")
+    for name in (env_id, "default"):
+        if name in found and not isinstance(found[name], dict):
+            raise ValueError(f"{conf}: expected hyperparameters by environment, got {found[name]!r} for {name}.")
 
 
 def _is_module(name: str) -> bool:

@@ -5,6 +5,7 @@ rl_zoo3 has no entry points: its modules share two dictionaries and a class, whi
 
 from __future__ import annotations
 
+import difflib
 import functools
 import importlib
 import sys
@@ -15,9 +16,11 @@ from pprint import pprint
 from typing import Any
 from unittest import mock
 
+import torch as th
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
@@ -25,10 +28,21 @@ from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
 from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback
 from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.zoo import configs, pretraining, resuming
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
+
+#: keys of a configuration that are rl_zoo3's or the zoo's here, no argument of the algorithm
+OWN_KEYS = (
+    *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps"),
+    *("noise_std", "noise_type", "normalize", "vec_env_wrapper", "checkpoint", "pretrain_env", "resume"),
+)
+
+#: those of them that count something
+WHOLE_NUMBERS = {"n_envs", "frame_stack"}
 
 
 def register() -> None:
@@ -67,9 +81,10 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     Three keys are ours: ``resume: auto``, ``checkpoint``, False or the keyword arguments of RunCheckpointCallback, and
     ``pretrain_env``.
 
-    :raises ValueError: if there is no file to read, or for values of the three keys that mean nothing
-    :raises RuntimeError: for a run that is still going
+    :raises ValueError: if there is no file to read, for values of the three keys that mean nothing, for a run that is still
+        going
     """
+    _check_device(manager.device)
     options = manager.args
     run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
     if run is not None and getattr(options, "conf_file", manager.config) is None:
@@ -82,7 +97,10 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
             manager.config = str(_default_config(manager.algo, manager.env_name.gym_id))
         else:
             manager.config = configs.resolve(manager.config)
+            configs.check(manager.config, manager.env_name.gym_id)
         hyperparams, config = original(manager)
+    if manager.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
+        raise ValueError(f"How long? Neither -n nor n_timesteps of {manager.env_name.gym_id} in {manager.config} says so.")
     resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
     checkpoint = hyperparams.pop("checkpoint", True)
     manager.pretrain_env = hyperparams.pop("pretrain_env", pretraining.PRIMAL)
@@ -100,6 +118,38 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     if run is not None:
         _go_on(manager, run)
     return hyperparams, config
+
+
+def _check_device(device: th.device | str) -> None:
+    try:
+        get_device(device)
+    except RuntimeError as error:
+        raise ValueError(f"--device {device}: {error}") from error
+
+
+def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> tuple[Any, ...]:
+    """What rl_zoo3 leaves is for the constructor: a name that it does not have is refused before a run's folder is made.
+
+    :raises ValueError: naming what may have been meant
+    """
+    given = hyperparams.get("learning_rate")
+    if isinstance(given, str) and not given.startswith("lin_"):
+        raise ValueError(f"learning_rate must be a number or 'lin_' and a number, got {given!r}.")
+    for name in WHOLE_NUMBERS & set(hyperparams):
+        check_integer(name, hyperparams[name], 1)
+    try:
+        found: tuple[dict[str, Any], ...] = original(manager, hyperparams)
+    except (NameError, SyntaxError) as error:
+        raise ValueError(f"A value that is read as Python cannot be: {error}.") from error
+    if "policy" not in found[0]:
+        raise ValueError(f"The hyperparameters of {manager.env_name.gym_id} in {manager.config} name no policy.")
+    known = named_parameters(ALGORITHMS[manager.algo].kind)
+    for name in found[0]:
+        if name not in known and name not in OWN_KEYS:
+            meant = difflib.get_close_matches(name, [*known, *OWN_KEYS])
+            hint = f"; did you mean {' or '.join(meant)}?" if meant else f": neither of rl_zoo3's nor of {manager.algo}'s."
+            raise ValueError(f"Unknown hyperparameter {name!r}{hint}")
+    return found
 
 
 def _default_config(algorithm: str, env_id: str) -> Path:
@@ -124,9 +174,12 @@ def _find_run(manager: Any, config: dict[str, Any], hyperparams: dict[str, Any])
 
 
 def _go_on(manager: Any, run: Path) -> None:
-    """In the run's own folder, where rl_zoo3 would begin a new one."""
+    """In the run's own folder, where rl_zoo3 would begin a new one.
+
+    :raises ValueError: for a run that is still going
+    """
     if resuming.is_going(run):
-        raise RuntimeError(f"Another process is at work in {run}.")
+        raise ValueError(f"Another process is at work in {run}.")
     manager.save_path, manager.params_path = str(run), str(run / manager.env_name)
     if resuming.has_checkpoint(run):
         manager.resumed_run, manager.continue_training = run, True
@@ -220,6 +273,7 @@ def _load_fitting_buffer(
 
 _AROUND: dict[str, Callable[..., Any]] = {
     "read_hyperparameters": _read_hyperparameters,
+    "_preprocess_hyperparams": _preprocess_hyperparams,
     "create_envs": _create_envs,
     "create_callbacks": _create_callbacks,
     "_load_pretrained_agent": _load_pretrained_agent,

@@ -251,19 +251,98 @@ def test_replay_of_another_phase_is_left_out(zoo):
     assert (model_in(resumed).phase, model_in(resumed).phase_timesteps) == ("pretraining", 28)
 
 
-def test_mistakes_are_named(zoo, monkeypatch):
+def refused(capsys, call, *arguments, **keywords) -> str:
+    """The line that a mistake costs."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match=r"^2$"):
+        call(*arguments, **keywords)
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("python -m sb3_dreamer_urlb.zoo train: ")
+    return line
+
+
+def test_mistakes_are_named(zoo, monkeypatch, capsys):
     run = train(zoo, STAND, 8, "lbs", params=TINY)
-    with pytest.raises(ValueError, match=r"preset='tiny', the configuration says 'small'"):
-        train(zoo, STAND, 8, "small/lbs", "-i", f"{run}/urlb-walker-stand-v0.zip")
-    with pytest.raises(ValueError, match=r"intrinsic_reward='lbs', the configuration says None"):
-        train(zoo, STAND, 8, "scratch", "-i", f"{run}/urlb-walker-stand-v0.zip")
-    with pytest.raises(ValueError, match="FineTuneCallback needs a pre-trained model"):
-        train(zoo, FLIP, 8, "finetune", params=TINY[:1])
+    snapshot = f"{run}/urlb-walker-stand-v0.zip"
+    line = refused(capsys, train, zoo, STAND, 8, "small/lbs", "-i", snapshot)
+    assert "preset='tiny', the configuration says 'small'" in line
+    line = refused(capsys, train, zoo, STAND, 8, "scratch", "-i", snapshot)
+    assert "intrinsic_reward='lbs', the configuration says None" in line
+    assert "FineTuneCallback needs a pre-trained model" in refused(capsys, train, zoo, FLIP, 8, "finetune", params=TINY[:1])
     monkeypatch.setattr("sb3_dreamer_urlb.zoo.configs.folder", lambda: Path("nowhere"))
-    with pytest.raises(ValueError, match="Name a configuration with -conf"):
-        zoo(*TRAIN, "--env", STAND)
+    assert "Name a configuration with -conf" in refused(capsys, zoo, *TRAIN, "--env", STAND)
     with pytest.raises(SystemExit):
         main(["dance"])
+
+
+SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
+
+
+@pytest.mark.parametrize(
+    ("param", "message"),
+    [
+        ("presett:'small'", "Unknown hyperparameter 'presett'; did you mean preset"),
+        ("zzz:1", "Unknown hyperparameter 'zzz': neither of rl_zoo3's nor of dreamerv2's."),
+        ("preset:tiny", "NameError: name 'tiny' is not defined. Values of -params"),
+        ("batch_size:-1", "batch_size must be an integer of at least 1, got -1"),
+        ("learning_rate:'fast'", "learning_rate must be a number or 'lin_' and a number, got 'fast'"),
+        ("n_envs:'two'", "n_envs must be an integer of at least 1, got 'two'"),
+        ("frame_stack:0", "frame_stack must be an integer of at least 1, got 0"),
+        ("normalize:'yes please'", "A value that is read as Python cannot be"),
+        ("policy:'CnnPolcy'", "Unknown policy 'CnnPolcy'"),
+        (f"callback:'{SWITCH}s'", "has no attribute 'PhaseSwitchCallbacks'"),
+        ("callback:'nowhere.Callback'", "No module named 'nowhere'"),
+        (f"callback:[{{'{SWITCH}': dict(frames=80)}}]", "got an unexpected keyword argument 'frames'"),
+        ("monitor_kwargs:dict(overide=True)", "got an unexpected keyword argument 'overide'"),
+        ("replay_buffer_kwargs:dict(stor='x')", "got an unexpected keyword argument 'stor'"),
+    ],
+)
+def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
+    line = refused(capsys, train, zoo, STAND, 8, "lbs", params=[*TINY, param])
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{STAND}:\n  policy: CnnPolicy\n", f"Neither -n nor n_timesteps of {STAND} in own.yml"),
+        (f"{STAND}:\n  n_timesteps: 8\n  preset: tiny\n", f"hyperparameters of {STAND} in own.yml name no policy"),
+        (f"{FLIP}:\n  policy: CnnPolicy\n", f"Hyperparameters not found for dreamerv2-{STAND} in own.yml"),
+        (f"{STAND}: 3\n", f"own.yml: expected hyperparameters by environment, got 3 for {STAND}"),
+        ("- a\n", "own.yml: expected hyperparameters by environment, got ['a']"),
+        ("", "own.yml: expected hyperparameters by environment, got None"),
+        ("a: [\n", "own.yml is not YAML: while parsing a flow"),
+    ],
+)
+def test_a_wrong_configuration_costs_a_line(zoo, capsys, text, message):
+    Path("own.yml").write_text(text)
+    assert message in refused(capsys, zoo, *TRAIN, "--env", STAND, "-conf", "own.yml", "--eval-freq", "-1")
+    assert not Path("logs/dreamerv2").exists()
+
+
+def test_an_environment_that_is_not_there_costs_a_line(zoo, capsys):
+    assert f"maybe meant {STAND}" in refused(capsys, train, zoo, STAND.replace("stand", "stnd"))
+    assert "No module named 'nowhere'" in refused(capsys, train, zoo, STAND, 8, "lbs", "--gym-packages", "nowhere")
+    assert "--device cud: Expected one of cpu, cuda" in refused(capsys, train, zoo, STAND, 8, "lbs", "--device", "cud")
+    Path("file").touch()
+    assert "Not a directory" in refused(capsys, train, zoo, STAND, 8, "lbs", "-f", "file", params=TINY)
+
+
+def test_errors_that_nobody_expects_keep_their_traceback(zoo, monkeypatch):
+    """Whatever is raised once the run collects, and what no check of arguments raises before."""
+    monkeypatch.setattr("fake_envs.CounterEnv.step", raising(ValueError("of the environment")))
+    with pytest.raises(ValueError, match="of the environment"):
+        train(zoo, STAND, 8, "lbs", params=TINY)
+    monkeypatch.setattr(DreamerV2, "_setup_model", raising(RuntimeError("of the machine")))
+    with pytest.raises(RuntimeError, match="of the machine"):
+        train(zoo, STAND, 8, "lbs", params=TINY)
+
+
+def raising(error):
+    def call(*args, **kwargs):
+        raise error
+
+    return call
 
 
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):

@@ -1,0 +1,78 @@
+"""What a user of rl_zoo3's commands got wrong costs a line and exit status 2; what went wrong otherwise keeps its traceback."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import gymnasium
+import yaml
+
+from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+
+#: what checks of arguments raise, here, in Stable-Baselines3, Gymnasium and rl_zoo3, and folders that cannot be written
+CHECKS = (ValueError, ImportError, OSError, gymnasium.error.Error, yaml.YAMLError)
+#: what Python says of arguments that a function does not have, or lacks
+SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
+
+
+@contextmanager
+def told_in_a_line(prog: str) -> Iterator[None]:
+    """Mistakes in options, configurations and environments end the program with a line, as long as no agent has acted.
+
+    Once a run collects or a trained agent plays, whatever is raised is not about arguments, and goes on upwards.
+
+    :param prog: name of the command
+    :raises SystemExit: 2, in place of such an error
+    """
+    begun: list[bool] = []
+    acts = {name: _noted(getattr(PhasedAlgorithm, name), begun) for name in ("collect_rollouts", "predict")}
+    with mock.patch.multiple(PhasedAlgorithm, **acts):
+        try:
+            yield
+        except Exception as error:
+            if begun or not _is_a_mistake(error):
+                raise
+            print(f"{prog}: {' '.join(str(error).split())}", file=sys.stderr)
+            raise SystemExit(2) from error
+
+
+def _noted(original: Callable[..., Any], calls: list[bool]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def noted(*args: Any, **kwargs: Any) -> Any:
+        calls[:] = [True]
+        return original(*args, **kwargs)
+
+    return noted
+
+
+def _is_a_mistake(error: Exception) -> bool:
+    if isinstance(error, AttributeError):  # a class named in a configuration that its module does not have
+        return isinstance(error.obj, ModuleType)
+    by_python = isinstance(error, TypeError) and any(phrase in str(error) for phrase in SIGNATURE)
+    return by_python or isinstance(error, CHECKS)
+
+
+def with_values_named(parse: Callable[..., argparse.Namespace]) -> Callable[..., argparse.Namespace]:
+    """``ArgumentParser.parse_args``; rl_zoo3 evaluates the values of some options as Python, and whatever that raises is told.
+
+    :param parse: the original
+    """
+
+    @functools.wraps(parse)
+    def parse_args(parser: argparse.ArgumentParser, *args: Any, **kwargs: Any) -> argparse.Namespace:
+        try:
+            return parse(parser, *args, **kwargs)
+        except Exception as error:
+            parser.error(
+                f"{type(error).__name__}: {error}. Values of -params and of environments' arguments are Python, in which text "
+                "has quotation marks: \"preset:'tiny'\""
+            )
+
+    return parse_args
