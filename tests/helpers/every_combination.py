@@ -24,7 +24,12 @@ from sb3_dreamer_urlb.nn import activation, distributions, precision
 from sb3_dreamer_urlb.world_model import convolution, gru
 
 #: environment variables that make of an x86 processor one with AVX2 and nothing newer: for oneDNN, torch, and our own kernels
-MASKED = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "SB3_DREAMER_URLB_MARCH": "x86-64-v3"}
+MASKED = {
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+    "SB3_DREAMER_URLB_MARCH": "x86-64-v3",
+}
 NUMBERS = spaces.Box(-1, 1, (5,), np.float32)
 SPACES = {
     "images and numbers": ("CnnPolicy", None, None),
