@@ -33,9 +33,10 @@ MAX_FPS = 25
 class VideoCallback(BaseCallback):
     """Films for TensorBoard's *Images* tab, every so many steps: ``video/agent`` and ``video/open_loop``.
 
-    ``video/agent`` is the beginning of an episode in an environment of its own, with the planner if it is on. Both films
-    are enlarged and labelled. ``video/open_loop`` is a part of the same episode in three panels: truth, model, error. The model sees the first
+    ``video/agent`` is the beginning of an episode in an environment of its own, with the planner if it is on.
+    ``video/open_loop`` is a part of the same episode in three panels: truth, model, error. The model sees the first
     ``context`` observations, then only the actions. Vectors have no open-loop film; of a Dict, the first image is shown.
+    Both are enlarged and labelled.
 
     Learning is not touched: training's random draws and environments stay as they are without this callback. A ``learn``
     with neither TensorBoard nor ``folder`` films nothing, with a warning.

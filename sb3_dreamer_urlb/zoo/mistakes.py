@@ -1,4 +1,4 @@
-"""What a user of rl_zoo3's commands got wrong costs a line and exit status 2; what went wrong otherwise keeps its traceback."""
+"""What a user of rl_zoo3's commands got wrong costs a line and exit status 2; whatever else goes wrong keeps its traceback."""
 
 from __future__ import annotations
 
