@@ -32,8 +32,11 @@ def told_in_a_line(prog: str) -> Iterator[None]:
     :raises SystemExit: 2, in place of such an error
     """
     begun: list[bool] = []
-    acts = {name: _noted(getattr(PhasedAlgorithm, name), begun) for name in ("collect_rollouts", "predict")}
-    with mock.patch.multiple(PhasedAlgorithm, **acts):
+    acts = [
+        mock.patch.object(PhasedAlgorithm, name, _noted(getattr(PhasedAlgorithm, name), begun))
+        for name in ("collect_rollouts", "predict")
+    ]
+    with acts[0], acts[1]:
         try:
             yield
         except Exception as error:
