@@ -98,9 +98,9 @@ def wanted() -> Iterator[Run]:
 # -- one run ---------------------------------------------------------------------------------------------------------------
 
 
-def make_env(task: str, seed: int, statistics: Path | None = None, training: bool = True) -> VecNormalize:
+def make_env(task: str, seed: int, statistics: Path | None = None, training: bool = True, n_envs: int = 1) -> VecNormalize:
     """Walker states, normalised: with the statistics of the pre-training where there was one."""
-    env = DummyVecEnv([lambda: Monitor(gymnasium.make(f"urlb/walker-{task}-v0", observation="state"))])
+    env = DummyVecEnv([lambda: Monitor(gymnasium.make(f"urlb/walker-{task}-v0", observation="state"))] * n_envs)
     env.seed(seed)
     normalized = VecNormalize(env, norm_reward=False, training=training)
     if statistics is not None:
@@ -196,13 +196,13 @@ def record(run: Run, episodes: list[tuple[int, float]]) -> None:
 
 
 def score(run: Run, model: DreamerV2, env: VecNormalize, folder: Path) -> None:
-    """Ten episodes with the actor alone and ten with Dyna-MPC, as rows."""
+    """Ten episodes with the actor alone and ten with Dyna-MPC, each from a start of its own and all at once, as rows."""
     save_statistics(env, folder / "statistics.npz")
     model.save(folder / "final.zip")
     method, keep_actor = ARMS[run.arm]
     rows = []
     for planner in (None, "dyna_mpc"):
-        unseen = make_env(run.task, EVALUATION_SEED + run.seed, folder / "statistics.npz", training=False)
+        unseen = make_env(run.task, EVALUATION_SEED + EPISODES * run.seed, folder / "statistics.npz", False, EPISODES)
         agent = DreamerV2.load(folder / "final.zip", env=unseen, device="cpu", planner=planner)
         began = time.monotonic()
         returns, _ = evaluate_policy(agent, unseen, EPISODES, return_episode_rewards=True)
