@@ -15,6 +15,7 @@ from sb3_dreamer_urlb.version import __version__
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
 MODULES = (
     "compare",
+    "demo",
     "discrepancy",
     "evaluate",
     "figures",
@@ -36,13 +37,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="sb3-dreamer-urlb", description=__doc__)
     parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    demo = commands.add_parser("demo", help="pre-train and fine-tune a small agent on walker pixels, and show the result")
-    demo.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_output)")
+    pixels = commands.add_parser(
+        "demo-pixels", help="pre-train and fine-tune a small agent on walker pixels, and show the result"
+    )
+    pixels.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_pixels_output)")
     tour = commands.add_parser("methods", help="pre-train and fine-tune once with every exploration method, and print a table")
     tour.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
     tour.add_argument("--methods", nargs="+", help="which (default: all)")
     tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
-    for run in (demo, tour):
+    for run in (pixels, tour):
         run.add_argument("--task", help="for example walker-walk (default: walker-stand)")
         run.add_argument("--seed", type=int)
         run.add_argument("--pretrain-frames", type=int)
@@ -66,14 +69,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Heavy imports only inside, so that --help answers at once.
         if command in modules:
             return int(modules[command].run(options))
-        return {"demo": _demo, "methods": _methods, "convert": _convert}[command](options)
+        return {"demo-pixels": _demo_pixels, "methods": _methods, "convert": _convert}[command](options)
     except (ValueError, ImportError, FileNotFoundError) as error:
         print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
         return 2
 
 
-def _demo(options: dict[str, Any]) -> int:
-    from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
+def _demo_pixels(options: dict[str, Any]) -> int:
+    from sb3_dreamer_urlb.cli.demo_pixels import DemoConfig, run_demo
 
     run_demo(DemoConfig(**options))
     return 0

@@ -18,7 +18,7 @@ MOVED = {
     "activation": "nn.activation",
     "arguments": "dreamer_v2.arguments",
     "choices": "spaces.choices",
-    "demo": "cli.demo",
+    "demo": "cli.demo_pixels",
     "dense": "nn.dense",
     "distributions": "nn.distributions",
     "env_steps": "envs.env_steps",

@@ -6,11 +6,12 @@ A group is a folder of a run, or LABEL=FOLDER,FOLDER,... for several seeds of on
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_dreamer_urlb.evaluation.run_facts import RunFacts
+    from sb3_dreamer_urlb.evaluation.tables import Table
 
 HELP = "lay runs or groups of seeds side by side, with intervals"
 TAGS = ("eval/mean_reward", "rollout/ep_rew_mean")
@@ -32,24 +33,37 @@ def run(options: dict[str, Any]) -> int:
     :raises ValueError: for groups that share no log
     :raises FileNotFoundError: if there is no run in a folder
     """
+    groups: dict[str, list[Path]] = {}
+    for text in options["runs"]:
+        label, equals, folders = text.rpartition("=")
+        paths = [Path(folder) for folder in folders.split(",")]
+        groups.setdefault(label if equals else paths[0].resolve().name, []).extend(paths)
+    table, written = compare_runs(groups, options["out"], options.get("tag"))
+    print(f"{table.text()}\nWrote {', '.join(map(str, written))}.")
+    return 0
+
+
+def compare_runs(groups: Mapping[str, Sequence[Path]], out: Path, tag: str | None = None) -> tuple[Table, list[Path]]:
+    """Write the page and its picture.
+
+    :param groups: label → folders of its runs
+    :param out: page
+    :param tag: of the log; None takes the first of ``TAGS`` that all runs have
+    :return: the table of last values, and the files that were written
+    :raises ValueError: for groups that share no log
+    :raises FileNotFoundError: if there is no run in a folder
+    """
     from sb3_dreamer_urlb.evaluation.comparison import compare
     from sb3_dreamer_urlb.evaluation.run_facts import read_run
     from sb3_dreamer_urlb.evaluation.run_page import compare_page, embedded_png
     from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
-    groups: dict[str, list[RunFacts]] = {}
-    for text in options["runs"]:
-        label, equals, folders = text.rpartition("=")
-        paths = [Path(folder) for folder in folders.split(",")]
-        label = label if equals else paths[0].resolve().name
-        groups.setdefault(label, []).extend(read_run(path) for path in paths)
-    picture, table, settings = compare(groups, options.get("tag"), TAGS)
-    out: Path = options["out"]
+    facts = {label: [read_run(folder) for folder in folders] for label, folders in groups.items()}
+    picture, table, settings = compare(facts, tag, TAGS)
     out.parent.mkdir(parents=True, exist_ok=True)
     picture.name = out.stem
     paths = picture.write(out.parent)
     page = compare_page(" against ".join(groups), embedded_png(paths[1]), picture.caption, settings, table)
     with written_atomically(out) as file:
         file.write(page.encode())
-    print(f"{table.text()}\nWrote {out}, {', '.join(map(str, paths))}.")
-    return 0
+    return table, [out, *paths]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import gymnasium
+import numpy as np
 import torch as th
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -73,7 +74,7 @@ def measure(model: DreamerV2, env: gymnasium.Env, repeat: int = 2) -> Pace:
     :param repeat: how often each part is timed
     """
     policy, batch = model.policy, _batch(model)
-    assert isinstance(batch.observation, th.Tensor)  # of pixels
+    assert isinstance(batch.observation, th.Tensor)  # pixels or a vector
     seen = batch.observation[0, :1]
     state = policy.initial_state(1)
     first = th.ones(1, dtype=th.bool, device=model.device)
@@ -124,9 +125,10 @@ def _batch(model: DreamerV2) -> SequenceBatch:
     space, lead = model.observation_space, (model.batch_size, model.batch_length)
     first = th.zeros(lead, dtype=th.bool)
     first[:, 0] = True
-    image = th.randint(0, 256, (*lead, *(space.shape or ())), dtype=th.uint8)
+    shape = (*lead, *(space.shape or ()))
+    seen = th.randint(0, 256, shape, dtype=th.uint8) if space.dtype == np.uint8 else th.randn(shape)
     action = th.rand(*lead, model.policy.actions.size) * 2 - 1
-    parts = (image, action, th.rand(lead), first, th.zeros(lead, dtype=th.bool))
+    parts = (seen, action, th.rand(lead), first, th.zeros(lead, dtype=th.bool))
     return SequenceBatch(*(part.to(model.device) for part in parts))
 
 

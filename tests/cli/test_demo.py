@@ -2,83 +2,138 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 
-import gymnasium
 import numpy as np
 import pytest
-import torch as th
-from fake_envs import CounterEnv
-from gymnasium import spaces
 from PIL import Image
 
-from sb3_dreamer_urlb import DreamerV2, __main__, __version__
-from sb3_dreamer_urlb.cli import demo
-from sb3_dreamer_urlb.cli.demo import DemoConfig, run_demo
-from sb3_dreamer_urlb.evaluation import figures, films
-from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
-from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score
+from sb3_dreamer_urlb import DreamerV2, __main__
+from sb3_dreamer_urlb.cli import demo_agents, pace, side_by_side
+from sb3_dreamer_urlb.cli.demo_agents import Agent
+from sb3_dreamer_urlb.cli.demo_pictures import curves, film
+from sb3_dreamer_urlb.cli.pace import Pace
+from sb3_dreamer_urlb.cli.side_by_side import PRETRAINED, SCRATCH, SHIPPED, DemoConfig, run_demo
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
 
 
-@pytest.fixture
-def fake_walker(monkeypatch):
-    """Put the counting environment in the walker's place; the ids that were asked for."""
-    made = []
-
-    def make(name, **kwargs):
-        made.append((name, kwargs))
-        return CounterEnv(
-            120, action_space=spaces.Box(-1, 1, (6,), np.float32), domain="walker", action_repeat=2, never_terminates=True
-        )
-
-    monkeypatch.setattr(demo.gymnasium, "make", make)
-    return made
-
-
-def check_output(out, pretrain_frames, size):
-    """Every promised file is there and holds what it should."""
-    assert {path.name for path in out.iterdir()} == {
-        f"pretrained_{pretrain_frames}.zip",
-        "finetuned.zip",
-        "tensorboard",
-        "learning_curve.png",
-        "open_loop.gif",
-        "open_loop.png",
-        "agent.gif",
-        "rows.csv",
-        ".rows.csv.lock",
-        "report.html",
-    }
-    assert list(out.glob("tensorboard/*/events*"))
-    with Image.open(out / "learning_curve.png") as picture:
-        assert picture.width > 400 and len(picture.convert("L").getcolors(256) or []) > 5
-    with Image.open(out / "open_loop.gif") as picture:
-        assert picture.size == (3 * 192, 192 + 2 * films.LINE) and picture.n_frames > 10
-    with Image.open(out / "agent.gif") as picture:
-        assert picture.n_frames > 10
-    before = DreamerV2.load(out / f"pretrained_{pretrain_frames}.zip", device="cpu")
-    after = DreamerV2.load(out / "finetuned.zip", device="cpu")
-    assert (before.phase, before.phase_frames) == ("pretraining", pretrain_frames)
-    assert after.phase == "finetuning" and after._n_updates > before._n_updates > 0 and after._planner_is_on()
-
-
-def test_run_demo(tmp_path, fake_walker, capsys):
+def test_everything_promised_is_written(tmp_path, capsys):
     out = tmp_path / "deep" / "out"
-    result = run_demo(DemoConfig(out, "walker-walk", 480, 480, episodes=2, preset="tiny"))
-    assert fake_walker == [("urlb/walker-walk-v0", {"fast_render": True, "render_mode": "rgb_array"})]
-    check_output(out, 480, 16)
-    # The counting environment pays 0, 1, 0.5 in turn, whatever one does.
-    assert result == {"fine-tuned agent": 60.0, "random policy": 60.0, "oracle": 965}
+    means = run_demo(DemoConfig(out, "walker-run", 1000, 1000, episodes=1, preset="tiny"))
+    assert {path.name for path in out.iterdir()} == {
+        *("scratch", "pretrained", "exploration"),
+        *("learning_curves.png", "agents.gif", "compare.html", "compare.png", "compare.pdf"),
+    }
+    for name, folder in ((SCRATCH, "scratch"), (PRETRAINED, "pretrained")):
+        returns = demo_agents.episodes(out / folder)
+        assert len(returns) == 1 and means[name] == pytest.approx(np.mean(returns))
+        rows = read_rows(out / folder / "rows.csv").rows
+        assert [(row.task, row.planner, row.finetune_frames) for row in rows] == [
+            ("run", "none", 1000),
+            ("run", "dyna_mpc", 1000),
+        ]
+        assert [row.pretrain_frames for row in rows] == [1000 * (name == PRETRAINED)] * 2
+    assert [row.keep_actor for row in rows] == [True] * 2
+    tuned = DreamerV2.load(out / "pretrained" / "finetuned.zip", device="cpu")
+    assert (tuned.phase, tuned.phase_frames, tuned.pretrained_frames) == ("finetuning", 1000, 1000)
+    with Image.open(out / "agents.gif") as picture:
+        assert picture.n_frames > 10 and picture.width == 2 * demo_agents.FILM_SIDE
     printed = capsys.readouterr().out
-    assert all(name in printed for name in ("fine-tuned agent", "random policy", "oracle", "open_loop.gif", "walker-walk"))
+    assert all(text in printed for text in (SCRATCH, PRETRAINED, "Dyna-MPC", "random actions", "compare.html", "walker run"))
+    # The training episode of both agents was told while they learnt.
+    assert re.search(r"^ +1000 +\d+ +\d+$", printed, re.MULTILINE)
 
 
-@pytest.mark.slow
-def test_run_demo_on_the_real_walker(tmp_path):
-    result = run_demo(DemoConfig(tmp_path, "walker-stand", 1100, 1100, episodes=1, preset="tiny"))
-    check_output(tmp_path, 1100, 64)
-    assert all(0 <= result[name] <= 1000 for name in result)
+def test_the_agent_that_ships_explored_without_a_reward():
+    assert SHIPPED.stat().st_size < 4e6
+    model = DreamerV2.load(SHIPPED, device="cpu")
+    assert (model.preset, model.intrinsic_reward, model.phase, model.phase_frames) == (
+        side_by_side.PRESET,
+        "lbs",
+        "pretraining",
+        40_000,
+    )
+    env = demo_agents.make_env("urlb/walker-flip-v0", statistics=SHIPPED.with_suffix(".json"))
+    assert env.obs_rms.count > 20_000 and env.training and not env.norm_reward
+
+
+def test_the_shipped_agent_learns_another_task(tmp_path, monkeypatch):
+    """Its actor and world model are kept; the statistics of its observations go on."""
+    monkeypatch.setattr(demo_agents, "_play", lambda *_: None)
+    agent = Agent(tmp_path / "agent", "urlb/walker-flip-v0", 1000, 0, side_by_side.PRESET, SHIPPED, 1)
+    finished = demo_agents.learn_task(agent)
+    before, after = (DreamerV2.load(path, device="cpu") for path in (SHIPPED, finished))
+    assert after.phase == "finetuning" and after._n_updates == before._n_updates  # a warm-up
+    for part in ("world_model.rssm", "actor"):
+        pairs = zip(before.policy.agent.get_submodule(part).parameters(),
+                    after.policy.agent.get_submodule(part).parameters(), strict=True)  # fmt: skip
+        assert all((one == other).all() for one, other in pairs)
+    count = load_vec_normalize(SHIPPED.with_suffix(".json"), demo_agents.make_env(agent.env_id).venv).obs_rms.count
+    moved = load_vec_normalize(finished.with_suffix(".json"), demo_agents.make_env(agent.env_id).venv).obs_rms.count
+    assert moved >= count + 500
+
+
+def test_without_a_renderer_only_the_film_is_missing(tmp_path, monkeypatch, capsys):
+    original = demo_agents.make_env
+
+    def blind(*args, filmed=False, **kwargs):
+        if filmed:
+            raise demo_agents.RenderingBackendError("nothing draws here")
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(demo_agents, "make_env", blind)
+    demo_agents.learn_task(Agent(tmp_path, "urlb/walker-stand-v0", 1000, 0, "tiny", None, 1))
+    assert (tmp_path / "rows.csv").exists() and not (tmp_path / "film.npy").exists()
+    assert "No film: nothing draws here" in capsys.readouterr().out
+
+
+def test_what_an_agent_dies_of_is_told(tmp_path):
+    agents = {SCRATCH: Agent(tmp_path, "urlb/walker-run-v0", 1000, 0, "tiny")}
+
+    class Dead:
+        def done(self):
+            return True
+
+        def result(self):
+            raise OSError("no space left on device")
+
+    with pytest.raises(OSError, match="no space left"):
+        side_by_side._watch([Dead()], agents)
+
+
+def test_half_written_episodes_are_not_read(tmp_path):
+    assert demo_agents.episodes(tmp_path) == []
+    (tmp_path / "monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n1.5,500,1\n-2,500,2\n3')
+    assert demo_agents.episodes(tmp_path) == [1.5, -2.0]
+
+
+# -- how long --------------------------------------------------------------------------------------------------------------
+
+
+def fitted(monkeypatch, update, **config):
+    monkeypatch.setattr(pace, "measure", lambda *_: Pace(update, 0.0, 0.0, 0.0))
+    monkeypatch.setattr(side_by_side, "_at_once", lambda: 2)
+    return side_by_side.fitted(DemoConfig(**config))
+
+
+def test_a_slow_machine_takes_fewer_frames_and_says_so(monkeypatch, capsys):
+    assert fitted(monkeypatch, 0.1) == DemoConfig()  # 1800 updates
+    printed = capsys.readouterr().out
+    assert "in place of" not in printed and "will take about 3 minutes" in printed
+    slow = fitted(monkeypatch, 0.75)
+    assert 20_000 * side_by_side.LEAST <= slow.finetune_frames < 20_000 and slow.finetune_frames % 1000 == 0
+    printed = capsys.readouterr().out
+    assert f"{slow.finetune_frames} frames in place of 20000" in printed and "would take about 22 minutes" in printed
+    assert fitted(monkeypatch, 100.0).finetune_frames == 8000
+    assert fitted(monkeypatch, 100.0, finetune_frames=30_000).finetune_frames == 30_000
+
+
+def test_one_core_takes_one_agent_after_the_other(monkeypatch):
+    monkeypatch.setattr(side_by_side.os, "sched_getaffinity", lambda _: {0}, raising=False)
+    assert side_by_side._at_once() == 1
+    monkeypatch.setattr(side_by_side.os, "sched_getaffinity", lambda _: {0, 1, 5}, raising=False)
+    assert side_by_side._at_once() == 2
 
 
 # -- command line ----------------------------------------------------------------------------------------------------------
@@ -86,160 +141,48 @@ def test_run_demo_on_the_real_walker(tmp_path):
 
 def test_arguments_reach_the_demo(monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr(demo, "run_demo", seen.append)
+    monkeypatch.setattr(side_by_side, "run_demo", seen.append)
     arguments = ["--task", "walker-run", "--seed", "3", "--pretrain-frames", "7", "--finetune-frames", "8", "--episodes", "9"]
-    assert __main__.main(["demo", "--out", str(tmp_path), *arguments, "--preset", "tiny"]) == 0
+    assert __main__.main(["demo", "--out", str(tmp_path), *arguments]) == 0
     assert __main__.main(["demo"]) == 0
-    assert seen == [DemoConfig(tmp_path, "walker-run", 7, 8, 9, 3, "tiny"), DemoConfig()]
+    assert seen == [DemoConfig(tmp_path, "run", 8, 7, 9, 3), DemoConfig()]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "walker-fly"], "Unknown task 'walker-fly'; known are"),
-        (["--preset", "huge"], "Unknown preset 'huge'; known are"),
-        (["--pretrain-frames", "0"], "pretrain_frames must be positive|frames must be positive"),
+        (["--task", "fly"], "Unknown task 'fly'; known are stand, walk, run, flip"),
+        (["--task", "quadruped-run"], "Unknown task 'quadruped-run'"),
+        (["--finetune-frames", "0"], "finetune_frames must be positive, got 0"),
+        (["--pretrain-frames", "-1"], "pretrain_frames must be an integer of at least 0, got -1"),
+        (["--episodes", "0"], "episodes must be positive, got 0"),
     ],
 )
-def test_errors_are_one_line_and_status_two(fake_walker, tmp_path, capsys, arguments, message):
+def test_errors_are_one_line_and_status_two(tmp_path, capsys, arguments, message):
     assert __main__.main(["demo", "--out", str(tmp_path / "out"), *arguments]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("sb3-dreamer-urlb: ") and re.search(message, error) and error.count("\n") == 1
+    assert error.startswith("sb3-dreamer-urlb: ") and message in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--finetune-frames", "-5000"]])
-@pytest.mark.filterwarnings("ignore")
-def test_numbers_that_make_no_sense_are_refused_at_once(fake_walker, tmp_path, monkeypatch, arguments):
-    monkeypatch.setattr(demo, "_train", lambda *_: pytest.fail("it trained"))
-    assert __main__.main(["demo", "--out", str(tmp_path / "out"), "--preset", "tiny", *arguments]) == 2
+def test_another_preset_needs_a_pre_training():
+    with pytest.raises(ValueError, match="preset='tiny' needs pretrain_frames"):
+        DemoConfig(preset="tiny")
 
 
-@pytest.mark.parametrize("arguments", [[], ["play"], ["demo", "--seed", "x"]])
-def test_a_wrong_command_line_is_refused(arguments, capsys):
-    with pytest.raises(SystemExit) as error:
-        __main__.main(arguments)
-    assert error.value.code == 2 and "usage: sb3-dreamer-urlb" in capsys.readouterr().err
+# -- pictures --------------------------------------------------------------------------------------------------------------
 
 
-def test_the_version_is_told(capsys):
-    with pytest.raises(SystemExit, match=r"^0$"):
-        __main__.main(["--version"])
-    assert capsys.readouterr().out == f"sb3_dreamer_urlb {__version__}\n"
+def test_curves(tmp_path):
+    curves({SCRATCH: [1.0, 2.0, 3.0], PRETRAINED: [4.0] * 9}, 1000, 2.0, "walker run", tmp_path / "curves.png")
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width > 400 and len(picture.convert("L").getcolors(256) or []) > 5
 
 
-def test_missing_plots_are_told_before_any_training(fake_walker, tmp_path, monkeypatch, capsys):
-    def missing():
-        raise ImportError(figures.MISSING_PLOTS)
-
-    monkeypatch.setattr(figures, "check_plots_installed", missing)
-    assert __main__.main(["demo", "--out", str(tmp_path / "out")]) == 2
-    assert "pip install" in capsys.readouterr().err and not (tmp_path / "out").exists() and fake_walker == []
-
-
-# -- evaluation ------------------------------------------------------------------------------------------------------------
-
-
-def test_play_episode(tiny_model):
-    env = CounterEnv(9, rewards=[1.0])
-    episode = play_episode(tiny_model(env), env, seed=0, render=True)
-    assert episode.observations.shape == (10, 16, 16, 3) and episode.actions.shape == (9, 2)
-    assert np.array_equal(episode.actions, env.received[-1]) and episode.total_reward == 9
-    assert len(episode.frames) == 9 and play_episode(tiny_model(env), env).frames == []
-
-
-def test_evaluate_uses_the_same_seeds_for_everyone(monkeypatch):
-    env, seeds = CounterEnv(3), []
-    original = env.reset
-    monkeypatch.setattr(env, "reset", lambda *, seed=None, options=None: seeds.append(seed) or original(seed=seed))
-    assert evaluate(RandomPolicy(env.action_space), env, 3) == [1.5] * 3
-    evaluate(RandomPolicy(env.action_space), env, 3)
-    assert seeds == [1000, 1001, 1002] * 2
-
-
-def test_random_policy_is_seeded():
-    space = spaces.Box(-1, 1, (2,), np.float32)
-    drawn = [[RandomPolicy(space, seed).predict(np.zeros(1))[0] for _ in range(3)] for seed in (1, 1, 2)]
-    assert np.array_equal(drawn[0], drawn[1]) and not np.array_equal(drawn[0], drawn[2])
-
-
-def test_open_loop_predicts_without_seeing(tiny_model):
-    """The first frames are inferred from observations, the later ones follow from the actions alone."""
-    env = CounterEnv(40)
-    model = tiny_model(env)
-    episode = play_episode(model, env)
-
-    def predict():
-        th.manual_seed(0)
-        return figures.open_loop(model.policy, episode, start=10, steps=20)
-
-    truth, predicted = predict()
-    assert truth.shape == predicted.shape == (25, 16, 16, 3) and predicted.dtype == np.uint8
-    assert np.array_equal(truth, episode.observations[10:35])
-    episode.observations[10 + figures.CONTEXT :] = 0
-    assert np.array_equal(predict()[1], predicted)
-    episode.observations[10 : 10 + figures.CONTEXT, 4:] = 255
-    assert not np.array_equal(predict()[1], predicted)
-
-
-def test_open_loop_predicts_from_the_actions(tiny_model):
-    env = CounterEnv(40)
-    model = tiny_model(env)
-    world_model = model.policy.agent.world_model
-    with th.no_grad():
-        world_model.rssm.input.weight[:, -2:] *= 20  # actions matter, and pictures show it
-        world_model.decoder.input.weight *= 20
-    episode = play_episode(model, env)
-
-    def predict(changed=None):
-        played = dataclasses.replace(episode, actions=episode.actions.copy())
-        if changed is not None:
-            played.actions[changed] = -np.sign(played.actions[changed])
-        th.manual_seed(0)
-        return figures.open_loop(model.policy, played, start=10, steps=20)[1]
-
-    border = 10 + figures.CONTEXT  # the first observation that is not shown; the action before led to it
-    same = [np.array_equal(*pair) for pair in zip(predict(), predict(border - 1), strict=True)]
-    assert all(same[: figures.CONTEXT]) and not same[figures.CONTEXT]
-    same = [np.array_equal(*pair) for pair in zip(predict(), predict(border), strict=True)]
-    assert all(same[: figures.CONTEXT + 1]) and not same[figures.CONTEXT + 1]
-    assert np.array_equal(predict(), predict(9 + 20 + figures.CONTEXT))  # leads past the end
-
-
-def test_three_panels():
-    truth, model = np.full((2, 4, 5, 3), 200, np.uint8), np.full((2, 4, 5, 3), 100, np.uint8)
-    panels = figures.truth_model_error(truth, model)
-    assert panels.shape == (2, 4, 15, 3) and panels.dtype == np.uint8
-    assert panels[0, 0, [0, 5, 10], 0].tolist() == [200, 100, 178]
-
-
-def test_a_labelled_film():
-    truth, model = (np.full((7, 16, 24, 3), level, np.uint8) for level in (200, 100))
-    film = figures.labelled_open_loop(truth, model, context=2, start=30)
-    assert film.shape == (7, 16 * 8 + 2 * films.LINE, 3 * 192, 3) and film.dtype == np.uint8
-    panels = film[:, films.LINE : -films.LINE]
-    assert np.array_equal(panels[:, ::8, ::8], figures.truth_model_error(truth, model))
-    above, below = film[:, : films.LINE], film[:, -films.LINE :]
-    assert all(above[0, :, i * 192 : (i + 1) * 192].any() for i in range(3)) and (above == above[0]).all()
-    assert len({line.tobytes() for line in below}) == 7  # each its step
-
-
-def test_errors_over_the_horizon(tiny_model, tmp_path):
-    env = CounterEnv(40)
-    model = tiny_model(env)
-    episode = play_episode(model, env)
-    assert episode.rewards.tolist() == [(0.0, 1.0, 0.5)[i % 3] for i in range(40)] and episode.total_reward == sum(
-        episode.rewards
-    )
-    th.manual_seed(0)
-    errors, rewards = figures.open_loop_errors(model.policy, episode, 10, 20, tmp_path / "errors.png")
-    th.manual_seed(0)
-    truth, predicted = figures.open_loop(model.policy, episode, 10, 20)
-    assert errors == pytest.approx(np.sqrt(((truth.astype(float) - predicted) ** 2).mean((1, 2, 3))))
-    assert rewards.shape == (25,) and np.isfinite(rewards).all()
-    with Image.open(tmp_path / "errors.png") as picture:
-        assert picture.width > 800 and len(picture.convert("L").getcolors(256) or []) > 5
-
-
-def test_scores():
-    assert len(ORACLE) == 12 and all(f"urlb/{task}-v0" in gymnasium.registry for task in ORACLE)
-    assert normalized_score("walker-stand", 909) == 1
+def test_films_stand_beside_each_other(tmp_path):
+    panels = {name: np.full((length, 32, 48, 3), level, np.uint8) for name, length, level in (("a", 4, 20), ("b", 3, 200))}
+    film(panels, tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as picture:
+        assert picture.n_frames in (1, 3) and picture.width == 96
+        pixels = np.asarray(picture.convert("L"))
+    assert abs(int(pixels[-1, 5]) - 20) < 8 and abs(int(pixels[-1, 90]) - 200) < 8

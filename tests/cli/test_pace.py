@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
-from sb3_dreamer_urlb.cli import demo, pace
-from sb3_dreamer_urlb.cli.demo import DemoConfig
+from sb3_dreamer_urlb.cli import demo_pixels, pace
+from sb3_dreamer_urlb.cli.demo_pixels import DemoConfig
 from sb3_dreamer_urlb.cli.pace import Amount, Pace
 
 
@@ -47,7 +47,7 @@ def test_durations_in_words(seconds, words):
 def fitted(monkeypatch, config, update):
     monkeypatch.setattr(pace, "measure", lambda *_: Pace(update, 0.0, 0.0, 0.0))
     env = CounterEnv(120, domain="walker", action_repeat=2)
-    return demo.fitted(config, env)
+    return demo_pixels.fitted(config, env)
 
 
 def test_a_slow_machine_takes_smaller_numbers_and_says_so(monkeypatch, capsys):
@@ -56,7 +56,7 @@ def test_a_slow_machine_takes_smaller_numbers_and_says_so(monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "in place of" not in printed and "will take about 2 seconds" in printed
     slow = fitted(monkeypatch, config, 1.5)
-    assert config.pretrain_frames > slow.pretrain_frames >= demo.LEAST * config.pretrain_frames
+    assert config.pretrain_frames > slow.pretrain_frames >= demo_pixels.LEAST * config.pretrain_frames
     assert config.finetune_frames > slow.finetune_frames and slow.episodes == 1
     printed = capsys.readouterr().out
     assert f"{slow.pretrain_frames} and {slow.finetune_frames} frames in place of 3000 and 12000" in printed
