@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -66,7 +67,7 @@ def make_env(env_id: str, n_envs: int = 1, statistics: Path | None = None, train
     :param monitor: folder of the log of episodes
     :param filmed: can be drawn
     """
-    film = {"render_mode": "rgb_array", "render_size": FILM_SIDE} if filmed else {}
+    film: dict[str, Any] = {"render_mode": "rgb_array", "render_size": FILM_SIDE} if filmed else {}
     plain: VecEnv = DummyVecEnv([lambda: Monitor(gymnasium.make(env_id, observation="state", **film), monitor)] * n_envs)
     if statistics is None:
         return VecNormalize(plain, training=training, norm_reward=False)
@@ -102,7 +103,7 @@ def learn_task(agent: Agent) -> Path:
     else:
         env = make_env(agent.env_id, statistics=agent.statistics, monitor=str(agent.folder))
         env.seed(1000 + agent.seed)
-        arguments = {"seed": agent.seed, "stats_window_size": WINDOW}
+        arguments: dict[str, Any] = {"seed": agent.seed, "stats_window_size": WINDOW}
         model = DreamerV2.load(agent.snapshot, env=env, device="cpu", **arguments)
         # Walker: the actor is kept, as in the paper (§3).
         model.fine_tune()
