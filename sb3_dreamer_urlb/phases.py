@@ -30,7 +30,7 @@ class Phase:
 PRETRAINING, FINETUNING = "pretraining", "finetuning"
 PHASES: dict[str, Phase] = {
     PRETRAINING: Phase(explores=True, random_warmup=True, plans=False, ent_coef=None),
-    # Also a run from scratch, without pre-training: the paper's DreamerV2 baseline.
+    # Also a run from scratch, without pre-training: the paper's baseline.
     FINETUNING: Phase(explores=False, random_warmup=False, plans=True, ent_coef=1e-4),
 }
 

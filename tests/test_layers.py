@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -53,3 +54,20 @@ def test_a_module_without_a_place_breaks_them(copy: Path) -> None:
     (copy / PACKAGE / "helpers.py").write_text("")
     done = lint(copy)
     assert done.returncode == 1 and "helpers" in done.stdout
+
+
+def test_what_lies_below_the_algorithms_names_none_of_them() -> None:
+    layers = (ROOT / ".importlinter").read_text().split("layers =\n")[1].split("\n[")[0].splitlines()
+    rooms = [line.strip() for line in layers if line.strip() and not line.strip().startswith("#")]
+    below = [room for line in rooms[rooms.index("dreamer_v2 | drq_v2") + 1 :] for room in line.split(" | ")]
+    files = [path for room in below for path in (ROOT / PACKAGE).rglob("*") if _room(path) == room]
+    assert {"algorithm", "agent", "spaces", "_moved"} <= set(below) and len(files) > 100
+    found = [str(path) for path in files if path.suffix in (".py", ".cpp", ".h") and NAMES.search(path.read_text())]
+    assert not found, f"These name an algorithm that stands above them: {found}"
+
+
+NAMES = re.compile(r"\b(DreamerV2|DrQv2)\b")
+
+
+def _room(path: Path) -> str:
+    return path.relative_to(ROOT / PACKAGE).parts[0].removesuffix(".py")

@@ -40,7 +40,7 @@ SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 class PhasedAlgorithm(CollectingAlgorithm):
     """An off-policy algorithm that pre-trains with an intrinsic reward and fine-tunes on a task (paper §2, §3).
 
-    The base of :class:`~sb3_dreamer_urlb.DreamerV2`, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
+    The base of every algorithm here, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
     does not depend on how an agent learns: phases and their counters, what the environment tells, ``learn``, faults, files.
     A subclass says, in the order in which they happen:
 

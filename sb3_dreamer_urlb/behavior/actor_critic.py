@@ -45,7 +45,7 @@ class Actor(nn.Module):
 
 
 class CategoricalActor(MLP):
-    """π(a | z) over choices among classes: one-hot actions whose samples carry straight-through gradients (DreamerV2).
+    """π(a | z) over choices among classes: one-hot actions whose samples carry straight-through gradients.
 
     :param feature_size: F
     :param classes: number of classes of each choice
@@ -134,7 +134,7 @@ class RewardNormalizer(nn.Module):
 
 
 def choose_gradient(actor_gradient: str, classes: Sequence[int]) -> str:
-    """What ``"auto"`` means: as DreamerV2, the dynamics for numbers, REINFORCE for choices.
+    """What ``"auto"`` means: as in Hafner et al., 2021, the dynamics for numbers, REINFORCE for choices.
 
     :param actor_gradient: one of ``ACTOR_GRADIENTS``, or ``AUTO``
     :param classes: number of classes of each choice that is an action; empty where actions are numbers
@@ -169,7 +169,7 @@ def actor_loss(target: th.Tensor, weight: th.Tensor) -> th.Tensor:
 def reinforce_loss(
     target: th.Tensor, value: th.Tensor, weight: th.Tensor, log_prob: th.Tensor, entropy: th.Tensor, ent_coef: float
 ) -> th.Tensor:
-    """− mean(weight · (log π(a) · (target of the next state − value of this one) + ent_coef · entropy)) (DreamerV2's Atari).
+    """− mean(weight · (log π(a) · (target of the next state − value of this one) + ent_coef · entropy)) (Hafner et al., 2021, for Atari).
 
     The model passes no gradient on: with one-hot actions and one-hot states it would be straight-through all the way.
 

@@ -71,7 +71,7 @@ class IntrinsicReward(ExplorationMethod, RewardSource):
     What snapshots must hold is a parameter or a buffer. See docs/howto/intrinsic_reward.md for an example.
     """
 
-    agent: ClassVar[str] = "DreamerV2"
+    reads: ClassVar[str] = "a world model"
     momentum: ClassVar[float] = 0.95
     #: entropy bonus of the actor while exploring with this reward
     ent_coef: ClassVar[float] = 0.0

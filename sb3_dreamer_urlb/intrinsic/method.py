@@ -14,8 +14,8 @@ class ExplorationMethod(nn.Module):
     :class:`~sb3_dreamer_urlb.intrinsic.transition_reward.TransitionReward`, which reads replayed steps.
     """
 
-    #: name of the algorithm that explores with it
-    agent: ClassVar[str]
+    #: what it makes its rewards of, for messages
+    reads: ClassVar[str]
     #: False: nothing for an actor to learn, pre-training acts uniformly at random
     trains_actor: ClassVar[bool] = True
     #: False: something changes in Python from update to update, as a counter or a schedule, and a recorded update would not

@@ -17,7 +17,7 @@ _REGISTRY: dict[str, type[ExplorationMethod]] = {}
 
 
 def register_intrinsic_reward(name: str, method: type[ExplorationMethod]) -> None:
-    """Make ``DreamerV2(..., intrinsic_reward=name)`` use ``method``; ``DrQv2`` if it is a ``TransitionReward``.
+    """Let ``intrinsic_reward=name`` mean ``method``, for the algorithms whose agents have what it reads.
 
     :param name: what users write
     :param method: subclass of :class:`IntrinsicReward`, or of ``TransitionReward``
@@ -40,7 +40,7 @@ def get_intrinsic_reward(name: str, kind: type[Method] = IntrinsicReward) -> typ
     known = registered_intrinsic_rewards(kind)
     if name in known:
         return known[name]
-    other = f" ({name!r} is for {_REGISTRY[name].agent})" if name in _REGISTRY else ""
+    other = f" ({name!r} reads {_REGISTRY[name].reads}, this agent's read {kind.reads})" if name in _REGISTRY else ""
     raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(known)}, and None for the task's reward{other}.")
 
 

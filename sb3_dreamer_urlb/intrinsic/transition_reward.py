@@ -40,13 +40,13 @@ class EncodedSteps:
 
 
 class TransitionReward(ExplorationMethod):
-    """A reward for replayed steps, in place of the task's while a :class:`~sb3_dreamer_urlb.DrQv2` pre-trains.
+    """A reward for replayed steps, in place of the task's while an agent without a world model pre-trains.
 
     A subclass takes its hyperparameters in ``__init__``, makes its networks in :meth:`build`, and says in :meth:`loss` what
     they learn and in :meth:`reward` what a step is worth. Parameters and buffers are what snapshots hold.
     """
 
-    agent: ClassVar[str] = "DrQv2"
+    reads: ClassVar[str] = "encoded steps"
 
     def __init__(self) -> None:
         super().__init__()

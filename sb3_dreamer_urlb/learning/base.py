@@ -30,7 +30,7 @@ class BaseLearner(Generic[AnyAgent, Batch]):
     A subclass makes its optimisers, then calls :meth:`_get_ready`.
 
     :param agent: the networks
-    :param compile: how updates run, see :class:`~sb3_dreamer_urlb.DreamerV2`
+    :param compile: how updates run, one of ``graphs.COMPILE``
     :param precision: of the products in the forward and backward passes, see there; all else is float32
     :param width: of the layers that most products are of, for ``precision="auto"``
     """

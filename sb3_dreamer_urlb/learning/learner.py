@@ -1,4 +1,4 @@
-"""One update of DreamerV2 on one batch: losses → backward → optimiser steps. The only place that trains its networks."""
+"""One update of world model, actor and critic on one batch: losses → backward → optimiser steps. The only place that trains its networks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, Observatio
 
 @dataclass(frozen=True)
 class LearnerConfig:
-    """The numbers of an update; see :class:`~sb3_dreamer_urlb.DreamerV2` for what each means and its default."""
+    """The numbers of an update: the algorithm's arguments of the same names, where each is explained and has its default."""
 
     learning_rate: float
     actor_learning_rate: float

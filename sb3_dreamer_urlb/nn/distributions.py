@@ -89,7 +89,7 @@ def draw_normal(shape: th.Size | tuple[int, ...], like: th.Tensor, generator: th
 
 
 def sample_one_hot(logits: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
-    """Draw one-hot vectors with straight-through gradients (DreamerV2): forward the draw, backward the probabilities.
+    """Draw one-hot vectors with straight-through gradients: forward the draw, backward the probabilities.
 
     :param logits: (…, S, K); float32, or the short format of products
     :param generator: source of randomness

@@ -18,7 +18,7 @@ _KINDS: dict[str, tuple[type[Planner], ...]] = {}
 def register_planner(
     name: str, planner: type[Planner], for_choices: type[Planner] | None = None, settled: dict[str, Any] | None = None
 ) -> None:
-    """Make ``DreamerV2(..., planner=name)`` use ``planner``.
+    """Let an algorithm's ``planner=name`` mean ``planner``.
 
     :param name: what users write
     :param planner: subclass of :class:`Planner`

@@ -70,7 +70,7 @@ def path_to_read(path: str | os.PathLike[str], suffix: str) -> Path:
             return candidate
     if path.is_dir():
         raise IsADirectoryError(
-            f"{path} is a folder, load() takes a file: a run folder goes on with DreamerV2.resume({str(path)!r}, env), "
+            f"{path} is a folder, load() takes a file: a run folder goes on with the algorithm's resume({str(path)!r}, env), "
             "what was pushed to the Hub is read by sb3_dreamer_urlb.hub.load_from_hub."
         )
     raise FileNotFoundError(2, "No such file", str(path))

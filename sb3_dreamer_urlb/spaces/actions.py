@@ -115,4 +115,4 @@ def make_actions(space: spaces.Space[Any]) -> Actions:
         return BoxActions(space)
     if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         return ClassActions(space)
-    raise UnsupportedSpaceError(f"DreamerV2 needs a Box, Discrete or MultiDiscrete action space, got {space}.")
+    raise UnsupportedSpaceError(f"An agent needs a Box, Discrete or MultiDiscrete action space, got {space}.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class UnsupportedSpaceError(ValueError, AssertionError):
-    """An observation or action space that DreamerV2 cannot learn in.
+    """An observation or action space that an agent cannot learn in.
 
     A ``ValueError`` like every other wrong argument, and the ``AssertionError`` that Stable-Baselines3 raises for spaces.
     """

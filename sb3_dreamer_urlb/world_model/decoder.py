@@ -19,7 +19,7 @@ from sb3_dreamer_urlb.world_model.convolution import convolve_elu, convolves_on_
 def deconvolution_kernels(size: int) -> list[int]:
     """Kernel sizes of stride-2 transposed convolutions that grow a 1×1 map to ``size``×``size`` exactly.
 
-    64 gives DreamerV2's [5, 5, 6, 6]: 1 → 5 → 13 → 30 → 64. Found backwards, so that every size has a chain.
+    64 gives the paper's [5, 5, 6, 6]: 1 → 5 → 13 → 30 → 64. Found backwards, so that every size has a chain.
 
     :param size: height and width of the image
     """

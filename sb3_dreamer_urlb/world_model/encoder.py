@@ -26,7 +26,7 @@ class Encoder(nn.Module):
 class ConvEncoder(Encoder):
     """Strided convolutions, an activation after each, flattened channel-first (docs/algorithm.md, "World model").
 
-    At 64×64 these are DreamerV2's four stages, 64 → 31 → 14 → 6 → 2; other sizes take as many stages as fit.
+    At 64×64 these are the paper's four stages, 64 → 31 → 14 → 6 → 2; other sizes take as many stages as fit.
 
     :param image_shape: (channels, height, width), height and width at least 16
     :param depth: channels of the first stage; they double with each stage, up to 8 × depth

@@ -1,4 +1,4 @@
-"""The RSSM's GRU behind its linear layer: a layer norm over all three parts, two gates, a candidate (DreamerV2)."""
+"""The RSSM's GRU behind its linear layer: a layer norm over all three parts, two gates, a candidate (Hafner et al., 2021)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def recur(parts: th.Tensor, norm: nn.LayerNorm, deter: th.Tensor) -> th.Tensor:
         return new
     reset, candidate, update = norm(full(parts)).chunk(3, -1)
     candidate = th.tanh(th.sigmoid(reset) * candidate)
-    # The bias of −1 makes a fresh GRU forget slowly (DreamerV2).
+    # The bias of −1 makes a fresh GRU forget slowly (Hafner et al., 2021).
     return th.lerp(deter, candidate, th.sigmoid(update - 1))
 
 

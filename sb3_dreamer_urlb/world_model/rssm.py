@@ -15,7 +15,7 @@ from sb3_dreamer_urlb.world_model.gru import recur
 
 
 class RSSM(nn.Module):
-    """Discrete latent dynamics of DreamerV2 (paper §2 "World models", docs/algorithm.md, "World model").
+    """Discrete latent dynamics (paper §2 "World models", docs/algorithm.md, "World model").
 
     :param action_size: A
     :param embed_size: E

@@ -26,7 +26,7 @@ class Acts(Protocol):
 
 
 class WorldModel(nn.Module):
-    """Encoder, RSSM, decoder and reward head of DreamerV2; a discount head where episodes can terminate.
+    """Encoder, RSSM, decoder and reward head (Hafner et al., 2021); a discount head where episodes can terminate.
 
     :param observations: what it sees
     :param action_size: A
@@ -156,7 +156,7 @@ class WorldModel(nn.Module):
         """How much the future after each state counts: γ, or γ · p(the episode goes on) with a discount head, (…).
 
         :param feature: float (…, F); (H + 1, N, F) of dreams if ``goes_on`` is given
-        :param goes_on: what is known about the states where the dreams begin, 0 or 1, float (N,): needs no guess (DreamerV2)
+        :param goes_on: what is known about the states where the dreams begin, 0 or 1, float (N,): needs no guess
         """
         if self.discount_logit is None:
             return th.full_like(feature[..., 0], self.gamma)
