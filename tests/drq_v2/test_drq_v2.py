@@ -79,7 +79,10 @@ def test_the_benchmarks_defaults():
         ({"learning_rate": -1}, "learning_rate must be a non-negative number or a schedule, got -1"),
         ({"freeze_encoder": 1}, "freeze_encoder must be True or False, got 1"),
         ({"buffer_size": 5}, "buffer_size=5 must not be smaller than frame_stack .* 6 rows"),
-        ({"intrinsic_reward": "lbs"}, r"Unknown intrinsic_reward 'lbs'; known are \['disagreement'\].*'lbs' reads a world model"),
+        (
+            {"intrinsic_reward": "lbs"},
+            r"Unknown intrinsic_reward 'lbs'; known are \['disagreement'\].*'lbs' reads a world model",
+        ),
         ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"ensemble_size": 1}}, "ensemble_size .*got 1"),
         ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"trains_encoder": 1}}, "trains_encoder .*got 1"),
         ({"policy_kwargs": {"net_arch": []}}, "net_arch must name at least one hidden layer"),
