@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from packaging.version import Version
 from places import ROOT
 
 from sb3_dreamer_urlb import __version__
@@ -19,5 +20,4 @@ def test_the_changelog_begins_with_it_and_the_citation_names_it() -> None:
 def test_old_names_end_with_a_later_version() -> None:
     sources = [path.read_text() for path in (ROOT / "sb3_dreamer_urlb").rglob("*.py")]
     ends = {found for text in sources for found in re.findall(r"old names? ends? with version (\d+)\.(\d+)", text)}
-    major, minor, _ = map(int, __version__.split("."))
-    assert ends and all((int(a), int(b)) > (major, minor) for a, b in ends)
+    assert ends and all(Version(f"{major}.{minor}") > Version(__version__) for major, minor in ends)

@@ -169,7 +169,7 @@ def actor_loss(target: th.Tensor, weight: th.Tensor) -> th.Tensor:
 def reinforce_loss(
     target: th.Tensor, value: th.Tensor, weight: th.Tensor, log_prob: th.Tensor, entropy: th.Tensor, ent_coef: float
 ) -> th.Tensor:
-    """− mean(weight · (log π(a) · (target of the next state − value of this one) + ent_coef · entropy)) (Hafner et al., 2021, for Atari).
+    """− mean(weight · (log π(a) · (target of the next state − value of this one) + ent_coef · entropy)) (Hafner et al., 2021).
 
     The model passes no gradient on: with one-hot actions and one-hot states it would be straight-through all the way.
 

@@ -1,4 +1,4 @@
-"""One update of world model, actor and critic on one batch: losses → backward → optimiser steps. The only place that trains its networks."""
+"""One update on one batch: losses → backward → optimiser steps. The only place that trains world model, actor and critic."""
 
 from __future__ import annotations
 
