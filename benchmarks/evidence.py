@@ -1,8 +1,8 @@
-"""Does pre-training pay? All runs that answer it on CPU cores: does what is missing, scores it, prints the table.
+"""Does pre-training pay? All runs that answer it on CPU cores: does what is missing, and scores it.
 
     python benchmarks/evidence.py run --minutes 120   # the next missing runs, one after the other, on one thread
-    python benchmarks/evidence.py table               # what the finished ones say, with intervals
     python benchmarks/evidence.py list                # what there is and what is missing
+    python benchmarks/evidence_results.py             # what the finished ones say, with intervals and a figure
 
 An agent that sees states (``observation="state"``) pre-trains on walker stand without its reward, then learns another task;
 beside it agents that learn that task from scratch. Everything lies in ``results/evidence``: ``episodes.csv``, a row for every
@@ -270,35 +270,6 @@ def work(minutes: float, at_most: int | None) -> None:
                 count += 1
 
 
-def measures(episodes: list[tuple[int, float]]) -> dict[str, float]:
-    """What a run is compared by: mean return over all of fine-tuning (area under its curve), and over its last quarter."""
-    scores = np.array([value for _, value in sorted(episodes)])
-    return {"whole": float(scores.mean()), "last quarter": float(scores[-max(len(scores) // 4, 1) :].mean())}
-
-
-def table() -> str:
-    """Interquartile mean over seeds with a 95 % stratified-bootstrap interval, for every task and arm."""
-    from rliable import library, metrics
-
-    found = curves()
-    lines = ["| task | arm | seeds | mean return, whole | mean return, last quarter |", "|---|---|---|---|---|"]
-    for task in sorted({task for _, tasks, _ in STUDY for task in tasks}, reverse=True):
-        for arm in ARMS:
-            runs = [measures(value) for name, value in found.items() if name.startswith(f"{task}/{arm}/")]
-            if len(runs) < 2:
-                continue
-            cells = []
-            for measure in ("whole", "last quarter"):
-                scores = {arm: np.array([[run[measure]] for run in runs])}
-                state = np.random.RandomState(0)
-                point, interval = library.get_interval_estimates(
-                    scores, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=20_000, random_state=state
-                )
-                cells.append(f"{point[arm][0]:.0f} [{interval[arm][0, 0]:.0f}, {interval[arm][1, 0]:.0f}]")
-            lines.append(f"| {task} | {arm} | {len(runs)} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -307,17 +278,14 @@ def main() -> None:
     run.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
     run.add_argument("--at-most", type=int, help="runs")
     commands.add_parser("list", help="all runs, and which are done")
-    commands.add_parser("table", help="of the finished runs (rliable)")
     options: Any = parser.parse_args()
     th.set_num_threads(1)
     if options.command == "run":
         work(options.minutes, options.at_most)
-    elif options.command == "list":
+    else:
         done = curves()
         for one in wanted():
             print("done   " if one.name in done else "missing", one.name)
-    else:
-        print(table())
 
 
 if __name__ == "__main__":

@@ -1,0 +1,140 @@
+"""What the runs of ``evidence.py`` say: a table with intervals, how many seeds a difference needs, and a figure.
+
+    python benchmarks/evidence_results.py                    # the table, as Markdown
+    python benchmarks/evidence_results.py --figure out.png   # learning curves, too
+
+Interquartile means over seeds with 95 % bootstrap intervals. The episodes of ``results/evidence/episodes.csv`` give the mean
+return over all of fine-tuning (the area under its curve) and over its last quarter; ``rows.csv`` gives the evaluations at its
+end, actor alone and with Dyna-MPC.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import evidence
+import numpy as np
+
+from sb3_dreamer_urlb.evaluation.aggregate import iqm
+from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.style import COLORS, frames_label, new_figure
+
+MEASURES = ("whole", "last quarter", "end, actor", "end, Dyna-MPC")
+LABELS = {
+    "scratch": "from scratch",
+    "lbs-kept": "LBS, actor kept",
+    "lbs-fresh": "LBS, fresh actor",
+    "random-fresh": "random actions, fresh actor",
+    "plan2explore-kept": "Plan2Explore, actor kept",
+}
+#: of a normal distribution: two-sided 5 % error, 80 % power
+_QUANTILES = 1.96 + 0.84
+#: of the bootstrap, at each episode
+FIGURE_REPETITIONS = 300
+
+#: task → arm → measure → one number a seed
+Scores = dict[str, dict[str, dict[str, list[float]]]]
+
+
+def scores() -> Scores:
+    """Of all finished runs."""
+    found: Scores = {}
+
+    def add(task: str, arm: str, measure: str, value: float) -> None:
+        found.setdefault(task, {}).setdefault(arm, {name: [] for name in MEASURES})[measure].append(value)
+
+    for name, episodes in evidence.curves().items():
+        task, arm, _ = name.split("/")
+        if task != "pretraining":
+            returns = [value for _, value in sorted(episodes)]
+            add(task, arm, "whole", float(np.mean(returns)))
+            add(task, arm, "last quarter", float(np.mean(returns[-max(len(returns) // 4, 1) :])))
+    for row in read_rows(evidence.ROOT / "rows.csv").rows:
+        add(row.task, row.further["arm"], f"end, {'actor' if row.planner == 'none' else 'Dyna-MPC'}", row.return_mean)
+    return found
+
+
+def seeds_needed(one: Sequence[float], other: Sequence[float]) -> int:
+    """An arm, so that a difference as large as the one seen is found at 5 % in four of five studies: two normal samples of the
+    spread that was seen.
+    """
+    variance = (np.var(one, ddof=1) + np.var(other, ddof=1)) / 2
+    difference = np.mean(one) - np.mean(other)
+    return max(2, math.ceil(2 * variance * (_QUANTILES / difference) ** 2)) if difference else 10**9
+
+
+def table(found: Scores) -> str:
+    """A line for every task and arm."""
+    lines = [f"| task | agent | seeds | {' | '.join(MEASURES)} |", "|---|---|---|" + "---|" * len(MEASURES)]
+    for task, arm in itertools.product(found, LABELS):
+        values = found[task].get(arm, {})
+        count = len(values.get("whole", ()))
+        if count < 2:
+            continue
+        cells = []
+        for measure in MEASURES:
+            found_here = iqm({task: values[measure]})
+            cells.append(f"{found_here.value:.0f} [{found_here.low:.0f}, {found_here.high:.0f}]")
+        lines.append(f"| {task} | {LABELS[arm]} | {count} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def needed(found: Scores) -> str:
+    """How many seeds an arm each difference from scratch needs."""
+    lines = [f"| task | against scratch | {' | '.join(MEASURES)} |", "|---|---|" + "---|" * len(MEASURES)]
+    for task, arm in itertools.product(found, LABELS):
+        mine, base = found[task].get(arm), found[task].get("scratch")
+        if arm == "scratch" or mine is None or base is None or min(len(mine["whole"]), len(base["whole"])) < 2:
+            continue
+        cells = []
+        for name in MEASURES:
+            difference = np.mean(mine[name]) - np.mean(base[name])
+            cells.append(f"{difference:+.0f}: {seeds_needed(mine[name], base[name])}")
+        lines.append(f"| {task} | {LABELS[arm]} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def draw(path: Path) -> None:
+    """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task."""
+    import matplotlib.pyplot as plt
+
+    episodes = evidence.curves()
+    tasks = list(scores())
+    figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 2.6)
+    for axes, task in zip(panels, tasks, strict=True):
+        for i, (arm, label) in enumerate(LABELS.items()):
+            runs = [[value for _, value in sorted(run)] for name, run in episodes.items() if name.startswith(f"{task}/{arm}/")]
+            if len(runs) < 2:
+                continue
+            length = min(map(len, runs))
+            points = [iqm({task: [run[at] for run in runs]}, FIGURE_REPETITIONS) for at in range(length)]
+            middle, low, high = np.array([(point.value, point.low, point.high) for point in points]).T
+            frames = evidence.REPEAT * 500 * np.arange(1, length + 1)
+            axes.plot(frames, middle, color=COLORS[i], label=f"{label} ({len(runs)})")
+            axes.fill_between(frames, low, high, color=COLORS[i], alpha=0.2, lw=0)
+        axes.set(title=f"walker {task}", xlabel="environment frames of the task", ylim=(0, None))
+        axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
+        axes.legend(loc="upper left", title="agent (seeds)", title_fontsize=7)
+    panels[0].set_ylabel("return of a training episode")
+    figure.tight_layout()
+    figure.savefig(path, dpi=160)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--figure", type=Path, help="PNG to draw the learning curves into")
+    options = parser.parse_args()
+    found = scores()
+    print(f"{table(found)}\n\nDifference from scratch, and seeds an arm that it needs:\n\n{needed(found)}")
+    if options.figure is not None:
+        draw(options.figure)
+
+
+if __name__ == "__main__":
+    main()
