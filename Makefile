@@ -25,7 +25,7 @@ export PYTHON TORCH_INDEX VENV
 ONE_THREAD := OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} LP_NUM_THREADS=$${LP_NUM_THREADS:-0}
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-gl demo test test-slow faults format lint type docs bench golden constraints clean clean-venv
+.PHONY: help setup setup-gl demo test test-slow faults format lint type docs notebook bench golden constraints clean clean-venv
 
 help:  ## list the targets
 	@echo "make TARGET, where TARGET is one of"
@@ -58,6 +58,9 @@ type: setup  ## check the types
 # Not --quiet: it would hide the warnings from --strict. The variable silences an advertisement of the theme's maker.
 docs: setup  ## build the documentation into site/; any warning fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+notebook: setup-gl  ## run examples/quickstart.ipynb and store it with its outputs
+	$(BIN)/python scripts/run_notebook.py
 
 bench: setup-gl  ## measure speed and memory on a CPU, ratios first, in under ten minutes (BENCH_ARGS)
 	$(BIN)/python benchmarks/update.py --repeat 1 $(BENCH_ARGS)

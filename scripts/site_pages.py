@@ -62,16 +62,31 @@ def file_of(page: str) -> Path:
 
 
 def text_of(path: Path) -> str:
-    """A file as Markdown: a notebook's cells without their outputs, Python as code, Markdown as it is."""
+    """A file as Markdown: a notebook's cells and what they put out, Python as code, Markdown as it is."""
     text = path.read_text()
     if path.suffix == ".ipynb":
-        cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(text)["cells"]]
-        return "\n\n".join(f"```python\n{source}\n```" if kind == "code" else source for source, kind in cells)
+        return "\n\n".join(part for cell in json.loads(text)["cells"] for part in cell_as_markdown(cell))
     if path.suffix not in CODE:
         return text
     # Code needs the width.
     hidden = "---\nhide:\n  - toc\n---\n\n"
     return f"{hidden}# {path.name}\n\n`````{CODE[path.suffix]}\n{text}`````\n"
+
+
+def cell_as_markdown(cell: dict[str, Any]) -> list[str]:
+    """A notebook's cell, then its outputs: text, and pictures inside the page."""
+    source = "".join(cell["source"])
+    if cell["cell_type"] != "code":
+        return [source]
+    parts = [f"```python\n{source}\n```"]
+    for output in cell["outputs"]:
+        data = output.get("data", {"text/plain": output.get("text", [])})
+        pictures = [kind for kind in data if kind.startswith("image/")]
+        for kind in pictures:
+            parts.append(f'<img alt="what the cell shows" src="data:{kind};base64,{"".join(data[kind].split())}">')
+        if not pictures:
+            parts.append(f"```text\n{''.join(data['text/plain']).rstrip()}\n```")
+    return parts
 
 
 def on_files(files: Files, config: MkDocsConfig, **_: Any) -> Files:

@@ -240,7 +240,8 @@ def pages_and_code_come_from_outside_of_docs(site):
     assert 'href="concepts/"' in start and 'src="images/learning_curve.png"' in start
     code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
     assert "class LBS" in re.sub(r"<[^>]*>", "", code)
-    assert "PRETRAIN_FRAMES" in (site / "quickstart/index.html").read_text()
+    notebook = (site / "quickstart/index.html").read_text()
+    assert "PRETRAIN_FRAMES" in notebook and notebook.count('src="data:image/') == 4 and "random actions" in notebook
 
 
 def pages_are_finished(site):
