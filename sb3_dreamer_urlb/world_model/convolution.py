@@ -31,7 +31,7 @@ from sb3_dreamer_urlb.native import image_ops, ops
 from sb3_dreamer_urlb.nn.activation import elu_
 from sb3_dreamer_urlb.nn.dense import column_sums
 from sb3_dreamer_urlb.nn.precision import product_dtype
-from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases
+from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Form, Patches, PatchesAndPhases, Phases, PhasesOnce
 
 #: Pixels a side of the narrow image up to which the passes are products on CPU. At 64×64 that is the last convolution and, in
 #: float32, the second transposed one. Measured layer by layer (docs/notes/performance-eager.md).
@@ -108,7 +108,9 @@ def _form(layer: nn.Conv2d | nn.ConvTranspose2d, x: th.Tensor, dtype: th.dtype) 
         return PatchesAndPhases(kernel, stride)
     if not transposed:
         return None
-    return Phases(kernel, stride) if kernel % stride == 0 else Direct(kernel, stride)
+    if kernel % stride:
+        return Direct(kernel, stride)
+    return Phases(kernel, stride) if dtype == th.bfloat16 else PhasesOnce(kernel, stride)
 
 
 class _OnTiles(Function):

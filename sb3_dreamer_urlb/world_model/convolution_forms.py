@@ -95,6 +95,16 @@ class Phases(Form):
         return phases.contiguous(memory_format=CHANNELS_LAST)
 
 
+class PhasesOnce(Direct):
+    """Phases where they pay most, to scatter: only there oneDNN computes what the stride then throws away.
+
+    Nothing is laid out, which takes as long as a pass does where channels are few.
+    """
+
+    def scatter(self, narrow: th.Tensor, weight: th.Tensor, bias: th.Tensor | None) -> th.Tensor:
+        return Phases(self.kernel, self.stride).scatter(narrow, weight, bias)
+
+
 class Patches(Form):
     """Products of a matrix of patches, which repeats pixels: between small images, where oneDNN is slow.
 
