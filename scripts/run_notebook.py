@@ -33,9 +33,7 @@ def executed(notebook: Any, folder: Path) -> Any:
     """
     for name in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR"):  # else in the home folder
         os.environ[name] = str(folder / name)
-    nbclient.NotebookClient(
-        notebook, timeout=None, resources={"metadata": {"path": folder}}, record_timing=False
-    ).execute()
+    nbclient.NotebookClient(notebook, timeout=None, resources={"metadata": {"path": folder}}, record_timing=False).execute()
     for cell in notebook.cells:
         if cell.cell_type == "code":
             # Warnings, whose text names this machine's folders.
