@@ -1,7 +1,7 @@
 """Runs examples/quickstart.ipynb and stores it with its outputs: python scripts/run_notebook.py, or make notebook.
 
-What it shows is what the present code does with the sizes in its first cell of code; about a minute. A digest of the sources is
-stored, so that a test sees when a cell was changed and the outputs were not.
+What it shows is what the present code does with the sizes in its first cell of code; about a minute. A digest of the sources
+is stored, so that a test sees when a cell was changed and the outputs were not.
 """
 
 from __future__ import annotations
