@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import os
 import re
 import subprocess
@@ -370,11 +371,11 @@ def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
 
 
 def test_a_run_that_is_not_there_costs_a_line(zoo, capsys):
-    for command in ("enjoy", "record_video"):
+    for command, algo in itertools.product(("enjoy", "record_video"), ("dreamerv2", "drq_v2")):
         with pytest.raises(SystemExit, match=r"^2$"):
-            zoo(command, "--algo", "dreamerv2", "--env", STAND, "-f", "logs")
+            zoo(command, "--algo", algo, "--env", STAND, "-f", "logs")
         [line] = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"python -m sb3_dreamer_urlb.zoo {command}: ") and "no run in logs/dreamerv2" in line
+        assert line.startswith(f"python -m sb3_dreamer_urlb.zoo {command}: ") and f"no run in logs/{algo}" in line
     Path("logs/dreamerv2/urlb-walker-run-v0_3").mkdir(parents=True)
     with pytest.raises(SystemExit):
         zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "logs", "--exp-id", "7")
