@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
 import subprocess
@@ -71,3 +72,16 @@ NAMES = re.compile(r"\b(DreamerV2|DrQv2)\b")
 
 def _room(path: Path) -> str:
     return path.relative_to(ROOT / PACKAGE).parts[0].removesuffix(".py")
+
+
+def test_only_one_place_knows_how_to_install() -> None:
+    """No message names a package index or a clone by itself (docstrings may say which extra a feature is)."""
+    told = []
+    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        documented = [node for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)]
+        skipped = {id(node.value) for node in documented}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and id(node) not in skipped and "pip install" in str(node.value):
+                told.append(str(path.relative_to(ROOT / PACKAGE)))
+    assert set(told) == {"version.py"}

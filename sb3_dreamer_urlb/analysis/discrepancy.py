@@ -9,6 +9,8 @@ import torch as th
 
 from sb3_dreamer_urlb.analysis.divergence import jensen_shannon
 from sb3_dreamer_urlb.analysis.trajectories import SEED, Trajectory, as_batch, check_fits, check_has_model
+from sb3_dreamer_urlb.algorithm import normalized
+from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.types import LatentState
 
 if TYPE_CHECKING:
@@ -40,7 +42,7 @@ def latent_dynamics_discrepancy(
     with th.no_grad(), th.random.fork_rng([device] if device.type == "cuda" else []):
         th.manual_seed(seed)
         for trajectory in trajectories:
-            batch = as_batch(finetuned.policy, trajectory)
+            batch = as_batch(finetuned.policy, trajectory, finetuned.get_vec_normalize_env())
             posterior = model.observe(model.preprocess(batch.observation), batch.action, batch.is_first)
             state = LatentState(posterior.state.stoch[0, :-1], posterior.state.deter[0, :-1])
             found.append(float(_divergence(before, after, state, batch.action[0, 1:]).mean()))
@@ -56,7 +58,7 @@ def check_comparable(pretrained: DreamerV2, finetuned: DreamerV2) -> None:
     """
     :param pretrained: before the fine-tuning
     :param finetuned: after it
-    :raises ValueError: naming what differs: spaces, domain, sizes, or a decoder that was not frozen
+    :raises ValueError: naming what differs: spaces, domain, sizes, statistics of observations, or a decoder that was not frozen
     """
     for model in (pretrained, finetuned):
         check_has_model(model)
@@ -73,8 +75,21 @@ def check_comparable(pretrained: DreamerV2, finetuned: DreamerV2) -> None:
         raise ValueError(
             f"The two models are of different sizes: {name} is {shapes[0].get(name)} before, {shapes[1].get(name)} after."
         )
+    _check_normalized_alike(pretrained, finetuned)
     if not all(th.equal(value, parts[1][name]) for name, value in parts[0].items() if name.startswith("decoder.")):
         raise ValueError(
             "The decoder changed, so a latent state means something else after fine-tuning than before: fine-tune this very "
             "snapshot with DreamerV2.load(snapshot, freeze_decoder=True)."
+        )
+
+
+def _check_normalized_alike(pretrained: DreamerV2, finetuned: DreamerV2) -> None:
+    before, after = pretrained.get_vec_normalize_env(), finetuned.get_vec_normalize_env()
+    normalized.check(before, after)
+    one, other = normalization.pack(before), normalization.pack(after)
+    seen = [name for name in one if name.startswith(f"{normalization.PREFIX}{normalization.OBSERVATION}")]
+    if not all(th.equal(one[name], other[name]) for name in seen):
+        raise ValueError(
+            "VecNormalize's statistics of observations moved in fine-tuning, so a latent state means something else after it "
+            "than before: fine-tune in a VecNormalize(training=False) with those of the pre-training."
         )

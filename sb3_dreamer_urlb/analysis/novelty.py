@@ -38,7 +38,7 @@ def intrinsic_reward_on(model: DreamerV2, trajectories: Sequence[Trajectory], se
         for trajectory in trajectories:
             source = copy.deepcopy(agent.intrinsic)
             assert source is not None
-            batch = as_batch(model.policy, trajectory)
+            batch = as_batch(model.policy, trajectory, model.get_vec_normalize_env())
             posterior = agent.world_model.observe(
                 agent.world_model.preprocess(batch.observation), batch.action, batch.is_first
             )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import SequenceBatch
@@ -32,7 +32,8 @@ OBSERVATION = "observation"
 class Trajectory:
     """One episode of T steps.
 
-    :param observations: as the policy takes them (images channels first), (T + 1, …); by name for Dict spaces
+    :param observations: of the environment, before any VecNormalize (each agent has its own); images channels first,
+        (T + 1, …); by name for Dict spaces
     :param actions: as the environment received them, (T, …)
     :param rewards: of the task, float (T,)
     """
@@ -52,21 +53,33 @@ def play_trajectories(model: DreamerV2, env: VecEnv, count: int = TRAJECTORIES, 
     :param env: of the task
     :param count: episodes
     :param seed: of the first; episode ``i`` begins with the seed ``seed + i``
-    :raises ValueError: for a number that is not positive, or an environment that normalises what the oracle sees: another
-        agent would see the same episode differently
+    :raises ValueError: for a number that is not positive, or a wrapper around VecNormalize that changes observations further:
+        what the environment gave is then lost
     """
     check_integer("trajectories", count, 1)
-    if unwrap_vec_normalize(env) is not None:
-        raise ValueError("Trajectories are compared across agents, so the environment must not be a VecNormalize.")
+    env, normalizer = _before_normalization(env)
     played: list[Trajectory] = []
     with th.random.fork_rng([model.device] if model.device.type == "cuda" else []):
         th.manual_seed(seed)
         while len(played) < count:
-            played += _first_episodes(model, env, min(env.num_envs, count - len(played)), seed + len(played))
+            played += _first_episodes(model, env, normalizer, min(env.num_envs, count - len(played)), seed + len(played))
     return played
 
 
-def _first_episodes(model: DreamerV2, env: VecEnv, count: int, seed: int) -> list[Trajectory]:
+def _before_normalization(env: VecEnv) -> tuple[VecEnv, VecNormalize | None]:
+    """What gives observations as they are, and what normalises them for the agent."""
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None:
+        return env, None
+    outer = env
+    while isinstance(outer, VecTransposeImage):
+        outer = outer.venv
+    if outer is not normalizer:
+        raise ValueError(f"Trajectories hold what the environment gave: {type(outer).__name__} around VecNormalize hides it.")
+    return normalizer.venv, normalizer
+
+
+def _first_episodes(model: DreamerV2, env: VecEnv, normalizer: VecNormalize | None, count: int, seed: int) -> list[Trajectory]:
     env.seed(seed)
     observation: Any = env.reset()
     state: tuple[np.ndarray, ...] | None = None
@@ -76,7 +89,8 @@ def _first_episodes(model: DreamerV2, env: VecEnv, count: int, seed: int) -> lis
     rewards: list[list[float]] = [[] for _ in range(count)]
     going = np.ones(count, bool)
     while going.any():
-        action, state = model.predict(observation, state, start, deterministic=True)
+        shown: Any = observation if normalizer is None else normalizer.normalize_obs(observation)
+        action, state = model.predict(shown, state, start, deterministic=True)
         observation, reward, start, infos = env.step(action)
         rows = _rows(model, observation)
         for i in np.flatnonzero(going):
@@ -190,13 +204,16 @@ def _shapes(seen: Any) -> Any:
     return seen.shape if isinstance(seen, spaces.Space) else np.shape(seen)[1:]
 
 
-def as_batch(policy: DreamerPolicy, trajectory: Trajectory) -> SequenceBatch:
+def as_batch(policy: DreamerPolicy, trajectory: Trajectory, normalizer: VecNormalize | None = None) -> SequenceBatch:
     """One trajectory as the replay would hand it to the model, (1, T + 1, …).
 
     :param policy: that scales the actions
     :param trajectory: what happened
+    :param normalizer: of the agent's observations; its statistics do not move
     """
     device, seen = policy.device, trajectory.observations
+    if normalizer is not None:
+        seen = normalizer.normalize_obs(seen)
     observation: Any
     if isinstance(seen, dict):
         observation = {name: th.as_tensor(part, device=device)[None] for name, part in seen.items()}

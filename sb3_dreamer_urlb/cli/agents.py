@@ -7,6 +7,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+#: ending of the file of statistics that belongs to a snapshot
+BESIDE = ".vec_normalize.json"
+
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -21,6 +24,20 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
     parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
     parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+
+
+def add_statistics_argument(parser: argparse.ArgumentParser, whose: str = "") -> None:
+    """How observations are normalised.
+
+    :param parser: of a command
+    :param whose: other agent's, ``"oracle"``
+    """
+    parser.add_argument(
+        f"--{whose}-vec-normalize" if whose else "--vec-normalize",
+        type=Path,
+        help=f"statistics of the {whose + ' ' if whose else ''}observations, JSON (default: a run folder's own, or "
+        f"NAME{BESIDE} beside NAME.zip)",
+    )
 
 
 def environments_at_a_time(options: dict[str, Any]) -> int:
@@ -66,15 +83,23 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
     from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
 
     kwargs = {name: typed(value) for name, value in pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
+    snapshot = _file(options["snapshot"])
     env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
     try:
-        statistics = options.get("vec_normalize")
-        return (
-            normalized_as_saved(env, _file(options["snapshot"])) if statistics is None else load_vec_normalize(statistics, env)
-        )
+        statistics = options.get("vec_normalize") or statistics_beside(snapshot)
+        return normalized_as_saved(env, snapshot) if statistics is None else load_vec_normalize(statistics, env)
     except BaseException:
         env.close()
         raise
+
+
+def statistics_beside(snapshot: Path) -> Path | None:
+    """The file of statistics that lies beside a snapshot, if there is one.
+
+    :param snapshot: ``NAME.zip``
+    """
+    found = snapshot.with_name(snapshot.name.removesuffix(".zip") + BESIDE)
+    return found if found.is_file() else None
 
 
 def _file(snapshot: Path) -> Path:

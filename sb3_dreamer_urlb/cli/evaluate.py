@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.cli.agents import add_evaluation_arguments, environments_at_a_time, load_agent, pairs, typed
+from sb3_dreamer_urlb.cli.agents import (
+    add_evaluation_arguments,
+    add_statistics_argument,
+    environments_at_a_time,
+    load_agent,
+    pairs,
+    typed,
+)
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.episodes import Evaluation
@@ -27,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=Path, help="CSV file that a row is added to")
     parser.add_argument("--npz", type=Path, help="folder of evaluations.npz, as Stable-Baselines3's EvalCallback writes it")
     parser.add_argument("--set", nargs="+", metavar="COLUMN=VALUE", help="columns of the row: arm=mine keep_actor=false")
-    parser.add_argument("--vec-normalize", type=Path, help="statistics of the observations, JSON (a run folder has its own)")
+    add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.cli.agents import add_statistics_argument
+
 HELP = "measure whether fine-tuning should keep the pre-trained actor"
 
 
@@ -18,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
     parser.add_argument("--episodes", type=int, default=5, help="with each actor (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=3000, help="of the first episode (default: %(default)s)")
+    add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb.cli.agents import add_statistics_argument
+
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.analysis.trajectories import Trajectory
 
@@ -18,6 +20,8 @@ def add_oracle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
     parser.add_argument("--oracle", type=Path, help="snapshot of an agent that has learnt the task: it plays")
     parser.add_argument("--trajectories", type=Path, help="folder of recorded episodes; with --oracle they are written there")
+    add_statistics_argument(parser)
+    add_statistics_argument(parser, "oracle")
     parser.add_argument("--count", type=int, default=30, help="trajectories (default: %(default)s, the paper's)")
     parser.add_argument("--seed", type=int, default=2000, help="of the first trajectory (default: %(default)s)")
     parser.add_argument("--rows", type=Path, help="CSV file of evaluations: the number is written beside this agent's")
@@ -39,7 +43,8 @@ def trajectories_of(options: dict[str, Any]) -> list[Trajectory]:
         if "trajectories" not in options:
             raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
         return load_trajectories(options["trajectories"], options["count"])
-    oracle, env = load_agent({**options, "snapshot": options["oracle"]}, min(options["count"], 10))
+    its = {**options, "snapshot": options["oracle"], "vec_normalize": options.get("oracle_vec_normalize")}
+    oracle, env = load_agent(its, min(options["count"], 10))
     try:
         played = play_trajectories(oracle, env, options["count"], options["seed"])
     finally:

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.cli.agents import add_evaluation_arguments, environment_of, environments_at_a_time, load_agent
+from sb3_dreamer_urlb.cli.agents import (
+    BESIDE,
+    add_evaluation_arguments,
+    add_statistics_argument,
+    environment_of,
+    environments_at_a_time,
+    load_agent,
+)
+
+if TYPE_CHECKING:
+    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 HELP = "plan with a pre-trained model and a known reward, without fine-tuning and with it"
 
@@ -23,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--freeze-decoder", action="store_true", help="while fine-tuning, for the latent dynamics discrepancy")
     parser.add_argument("--save", type=Path, help="snapshot of the fine-tuned model")
     parser.add_argument("--rows", type=Path, help="CSV file that the rows are added to")
+    add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 
@@ -59,7 +70,20 @@ def run(options: dict[str, Any]) -> int:
             columns = {"adaptation": how, "known_reward": "true", "snapshot": options["snapshot"]}
             append_row(options["rows"], row_of(model, env, played, keep_actor=False, **columns))
         if frames and "save" in options:
-            model.save(options["save"])
+            save(model, options["save"])
         train_env.close()
         env.close()
     return 0
+
+
+def save(model: DreamerV2, path: Path) -> None:
+    """Write a model and, beside it, what normalises its observations.
+
+    :param model: in its environment
+    :param path: of the snapshot
+    """
+    from sb3_dreamer_urlb.hub.statistics import save_vec_normalize
+
+    model.save(path)
+    if (normalizer := model.get_vec_normalize_env()) is not None:
+        save_vec_normalize(normalizer, path.with_name(path.name.removesuffix(".zip") + BESIDE))

@@ -21,6 +21,7 @@ from torch import nn
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.spaces.observations import DictObservations
 from sb3_dreamer_urlb.types import LatentState, Observation
+from sb3_dreamer_urlb.version import how_to_install
 
 #: what follows the observations, in this order
 MEMORY = ("stoch", "deter", "last_action", "is_first", "uniforms")
@@ -201,7 +202,7 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     :raises ImportError: without the extra ``export``
     """
     if missing := [name for name in ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
-        raise ImportError(f"Writing ONNX needs {' and '.join(missing)}: pip install '.[export]'.")
+        raise ImportError(f"Writing ONNX needs {' and '.join(missing)}; {how_to_install('export')}.")
     example = step.example()
     batch = th.export.Dim("n")
     with th.no_grad(), warnings.catch_warnings():

@@ -17,8 +17,9 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.names import TASKS
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M, normalized_score
+from sb3_dreamer_urlb.version import how_to_install
 
-MISSING_RLIABLE = "Interquartile means and intervals need rliable: pip install '.[plots]'."
+MISSING_RLIABLE = f"Interquartile means and intervals need rliable; {how_to_install('plots')}."
 #: of a run's budget of frames: so near is at its end (the last evaluation may come a few steps late or early)
 NEAR = 0.05
 REPETITIONS, SIZE = 2000, 0.95

@@ -14,6 +14,7 @@ from sb3_dreamer_urlb.evaluation.names import TASKS
 from sb3_dreamer_urlb.evaluation.run_facts import AGENT, RunFacts, Series, thinned
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score, published_returns
 from sb3_dreamer_urlb.evaluation.style import COLORS, RC, check_matplotlib_installed, frames_label
+from sb3_dreamer_urlb.version import how_to_install
 
 TEMPLATES = Path(__file__).parent / "templates"
 #: headings → beginnings of the tags below them; a tag stands below the first that fits
@@ -64,7 +65,7 @@ def render(template: str, **values: Any) -> str:
     try:
         import jinja2
     except ImportError as error:
-        raise ImportError("Pages need jinja2: pip install '.[plots]'.") from error
+        raise ImportError(f"Pages need jinja2; {how_to_install('plots')}.") from error
     loader = jinja2.FileSystemLoader(TEMPLATES)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     return environment.get_template(template).render(**values)

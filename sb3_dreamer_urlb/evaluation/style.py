@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_dreamer_urlb.evaluation.aggregate import Estimate
+from sb3_dreamer_urlb.version import how_to_install
 
 #: Okabe and Ito's colours, told apart by everybody, in the order of use
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#B2A200", "#7F3C8D")
@@ -50,7 +51,7 @@ def check_matplotlib_installed() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ImportError("Figures need matplotlib: pip install '.[plots]'.") from error
+        raise ImportError(f"Figures need matplotlib; {how_to_install('plots')}.") from error
 
 
 @dataclass

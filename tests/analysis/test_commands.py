@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from counter_task import ENV
+from counter_task import ENV, STATES
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.__main__ import main
@@ -13,6 +15,7 @@ from sb3_dreamer_urlb.analysis.discrepancy import latent_dynamics_discrepancy
 from sb3_dreamer_urlb.analysis.novelty import intrinsic_reward_on
 from sb3_dreamer_urlb.analysis.trajectories import load_trajectories
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.hub import load_vec_normalize, save_vec_normalize
 
 SMALL = ("--episodes", "1", "--device", "cpu")
 
@@ -48,6 +51,26 @@ def test_the_whole_study(snapshots, weights, tmp_path, capsys):
     assert main(["figures", str(rows), "--out", str(tmp_path / "figures"), "--repetitions", "10"]) == 0
     drawn = {path.stem for path in (tmp_path / "figures").rglob("*.png")}
     assert {"discrepancy", "zero_shot"} <= drawn
+
+
+def test_a_study_of_an_agent_that_sees_normalised_states(tmp_path, capsys):
+    """As a user does it: model.save, its statistics beside it, and every command finds them."""
+    env = VecNormalize(make_vec_env(STATES, 1), norm_reward=False)
+    model = DreamerV2("MlpPolicy", env, preset="tiny", seed=0, device="cpu", intrinsic_reward="lbs").learn(28)
+    pretrained, tuned, rows = tmp_path / "before.zip", tmp_path / "after.zip", tmp_path / "rows.csv"
+    model.save(pretrained)
+    save_vec_normalize(env, tmp_path / "before.vec_normalize.json")
+    options = ["--finetune-frames", "56", "--freeze-decoder", "--save", str(tuned), "--rows", str(rows)]
+    assert main(["zero-shot", str(pretrained), "--env", STATES, *options, *SMALL]) == 0
+    beside = [load_vec_normalize(path, make_vec_env(STATES, 1)) for path in sorted(tmp_path.glob("*.json"))]
+    assert len(beside) == 2 and beside[0].obs_rms.mean.tolist() == beside[1].obs_rms.mean.tolist() == env.obs_rms.mean.tolist()
+    oracle = ["--env", STATES, "--oracle", str(tuned), "--count", "2", "--device", "cpu", "--rows", str(rows)]
+    assert main(["discrepancy", str(pretrained), str(tuned), *oracle]) == 0
+    assert main(["oracle-reward", str(pretrained), *oracle]) == 0
+    assert main(["keep-actor", str(pretrained), "--env", STATES, "--episodes", "1", "--device", "cpu"]) == 0
+    assert main(["evaluate", str(tuned), "--env", STATES, "--planner", "on", *SMALL]) == 0
+    after = max(read_rows(rows).rows, key=lambda row: row.finetune_frames)
+    assert float(after["ldd"]) > 0 and after["intrinsic_reward"] != ""
 
 
 @pytest.mark.parametrize(("method", "said"), [("icm", "learn_task_reward=True"), ("tuned", "needs a pre-trained snapshot")])

@@ -80,7 +80,7 @@ def _analyses(row: Any, methods: tuple[str, ...], task: str, seed: int, generato
     if "plan2explore" in methods:
         hard = float(generator.uniform(0.1, 1.0))
         yield row("plan2explore", task, seed, 0.4 - 0.2 * hard, planner="mppi", finetune_frames=0)
-        yield row("plan2explore", task, seed, 0.5, planner="mppi", ldd=round(20 * hard, 3))
+        yield row("plan2explore", task, seed, 0.5, planner="mppi", ldd=round(0.6 * hard, 3))
         yield row("plan2explore", task, seed, 0.9, known_reward=True)
 
 
