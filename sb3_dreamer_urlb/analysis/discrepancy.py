@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import torch as th
 
+from sb3_dreamer_urlb.algorithm import normalized
 from sb3_dreamer_urlb.analysis.divergence import jensen_shannon
 from sb3_dreamer_urlb.analysis.trajectories import SEED, Trajectory, as_batch, check_fits, check_has_model
-from sb3_dreamer_urlb.algorithm import normalized
 from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.types import LatentState
 
