@@ -58,7 +58,8 @@ def check_comparable(pretrained: DreamerV2, finetuned: DreamerV2) -> None:
     """
     :param pretrained: before the fine-tuning
     :param finetuned: after it
-    :raises ValueError: naming what differs: spaces, domain, sizes, statistics of observations, or a decoder that was not frozen
+    :raises ValueError: naming what differs: spaces, domain, sizes, statistics of observations; or a decoder that was not
+        frozen
     """
     for model in (pretrained, finetuned):
         check_has_model(model)

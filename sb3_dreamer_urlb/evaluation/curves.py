@@ -7,12 +7,16 @@ from typing import Any
 
 from sb3_dreamer_urlb.evaluation.aggregate import Estimate, mean_and_error
 from sb3_dreamer_urlb.evaluation.arms import Arm
+from sb3_dreamer_urlb.evaluation.figure_parts import REFERENCE_NAMES
 from sb3_dreamer_urlb.evaluation.names import ALIASES, TASKS
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row, frames, texts
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, finish, frames_label, lines, new_figure
+from sb3_dreamer_urlb.phases import keeps_actor
 
 PANELS = 4
+#: value of ``keep_actor`` in a condition
+TASK_AWARE = "task_aware"
 
 
 def selected(rows: Iterable[Row], text: str) -> Arm:
@@ -20,7 +24,7 @@ def selected(rows: Iterable[Row], text: str) -> Arm:
 
     :param rows: to choose from
     :param text: such as ``"method=lbs planner=none"``, with ``label=...`` (underscores are spaces) to name it; commas or
-        spaces between the conditions
+        spaces between the conditions. ``keep_actor=task_aware``: as the paper's rule has it for each domain
     :raises ValueError: for a condition that cannot be read, a column that no row has, or no rows
     """
     rows = list(rows)
@@ -34,7 +38,15 @@ def selected(rows: Iterable[Row], text: str) -> Arm:
             label = value.replace("_", " ")
         else:
             conditions[name] = _as_written(name, value)
-    found = tuple(row for row in rows if all(texts(row).get(name, "") == value for name, value in conditions.items()))
+    rule = conditions.get("keep_actor") == TASK_AWARE
+    if rule:
+        del conditions["keep_actor"]
+    found = tuple(
+        row
+        for row in rows
+        if all(texts(row).get(name, "") == value for name, value in conditions.items())
+        and (not rule or row.keep_actor in (None, keeps_actor(row.domain)))
+    )
     if not found:
         raise ValueError(f"No row has {text!r}.")
     return Arm(label, found)
@@ -73,7 +85,10 @@ def learning_curves(
     :param normalizer: of scores
     :param synthetic: mark as made up
     :param name: of the files
+    :raises ValueError: if an arm holds runs that differ in more than seed and task: they would be averaged
     """
+    for arm in arms:
+        _check_one_row_a_run(arm)
     tasks = sorted({f"{row.domain}-{row.task}" for arm in arms for row in arm.rows})
     scored = all(task in TASKS for task in tasks)
     panels: list[tuple[str, str | None]] = [("mean of the tasks", None)] if scored and len(tasks) > 1 else []
@@ -90,9 +105,21 @@ def learning_curves(
         one.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
     numbers = [len(values) for arm in arms for values in _seeds_by_task(arm).values()]
     seeds = f"{min(numbers)} seeds" if min(numbers) == max(numbers) else f"{min(numbers)} to {max(numbers)} seeds"
-    unit = "Normalised score in % of the reference" if scored else "Undiscounted return"
+    unit = f"Normalised score in % of {REFERENCE_NAMES[normalizer]}" if scored else "Undiscounted return"
     caption = f"Evaluations while fine-tuning. {unit}; bands: mean ± standard error of {seeds} a task."
     return finish(name, figure, caption, synthetic, handles, 3 if len(panels) > 1 else 2)
+
+
+def _check_one_row_a_run(arm: Arm) -> None:
+    seen: dict[tuple[Any, ...], Row] = {}
+    for row in arm.rows:
+        other = seen.setdefault((row.domain, row.task, row.seed, row.finetune_frames), row)
+        if other is not row:
+            one, two = dict(row.key), dict(other.key)
+            columns = ", ".join(name for name in sorted({*one, *two}) if one.get(name) != two.get(name))
+            raise ValueError(
+                f"{arm.label!r} holds runs that differ in {columns} and would be averaged: choose one of them by COLUMN=VALUE."
+            )
 
 
 def _drawn(axes: Any, series: Mapping[str, Mapping[int, Estimate]], scale: float) -> list[Any]:

@@ -13,9 +13,10 @@ from sb3_dreamer_urlb.evaluation.aggregate import (
     probability_of_improvement,
 )
 from sb3_dreamer_urlb.evaluation.arms import Study, acts, task_aware
+from sb3_dreamer_urlb.evaluation.figure_parts import DOMAINS, OVERALL
 from sb3_dreamer_urlb.evaluation.names import TASKS, method
-from sb3_dreamer_urlb.evaluation.paper_figures import DOMAINS, OVERALL, correlation
 from sb3_dreamer_urlb.evaluation.rows import Row
+from sb3_dreamer_urlb.evaluation.scatter import correlation
 from sb3_dreamer_urlb.evaluation.scores import NORMALIZERS, published_returns, published_scores
 from sb3_dreamer_urlb.evaluation.style import frames_label
 from sb3_dreamer_urlb.evaluation.tables import MISSING, Table, percent, seeds, with_error, with_interval

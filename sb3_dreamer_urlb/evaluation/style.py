@@ -109,9 +109,11 @@ def finish(name: str, figure: Any, caption: str, synthetic: bool, handles: Seque
     :param columns: of the legend
     """
     width, height = figure.get_size_inches()
-    lines = textwrap.wrap(caption, int(width * 17.5))
+    lines = textwrap.wrap(caption, int(width * 19), break_on_hyphens=False)
     rows = math.ceil(len(handles) / columns) if handles else 0
-    below = 0.08 + 0.135 * len(lines) + (0.175 * rows + 0.05 if rows else 0.0)
+    # As full as each other: matplotlib fills columns, and would leave the last ones short.
+    columns = math.ceil(len(handles) / rows) if rows else columns
+    below = 0.08 + 0.135 * len(lines) + (0.15 * rows + 0.1 if rows else 0.0)
     total = height + below
     figure.set_size_inches(width, total)
     figure.tight_layout(rect=(0, below / total, 1, 1), w_pad=0.8)

@@ -18,8 +18,8 @@ from sb3_dreamer_urlb.evaluation.aggregate import Estimate
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.arms import Study
 from sb3_dreamer_urlb.evaluation.curves import curve, learning_curves, selected
-from sb3_dreamer_urlb.evaluation.paper_figures import correlation
 from sb3_dreamer_urlb.evaluation.rows import Row
+from sb3_dreamer_urlb.evaluation.scatter import correlation
 from sb3_dreamer_urlb.evaluation.scores import published_returns
 from sb3_dreamer_urlb.evaluation.style import bars, frames_label, new_figure
 from sb3_dreamer_urlb.evaluation.tables import Table
@@ -142,7 +142,10 @@ def test_correlation_by_hand() -> None:
 
 
 def test_learning_curves_of_two_arms(rows: list[Row]) -> None:
-    texts = ("method=lbs,planner=none,pretrain_frames=2M,label=with_LBS", "method=dreamer")
+    texts = (
+        "method=lbs,planner=none,pretrain_frames=2M,keep_actor=task_aware,keep_critic=false,label=with_LBS",
+        "method=dreamer",
+    )
     arms = [selected(rows, text) for text in texts]
     plain = [tuple(row for row in arm.rows if not (row["variant"] or row["perturbation"])) for arm in arms]
     picture = learning_curves([replace(arm, rows=own) for arm, own in zip(arms, plain, strict=True)], synthetic=True)
@@ -151,6 +154,16 @@ def test_learning_curves_of_two_arms(rows: list[Row]) -> None:
     one = selected(two, "method=lbs")
     point = curve(one, "dreamer_2m")[100_000]
     assert (point.value, point.error) == (pytest.approx(0.75), pytest.approx(0.25))
+
+
+def test_a_curve_follows_the_rule_of_the_paper_or_one_setting() -> None:
+    jaco = {"domain": "jaco", "task": "reach_top_left"}
+    both = [replace(ROW, **where, keep_actor=keep) for where in ({}, jaco) for keep in (True, False)]
+    with pytest.raises(ValueError, match="'method=lbs' holds runs that differ in keep_actor"):
+        learning_curves([selected(both, "method=lbs")])
+    arm = selected(both, "method=lbs,keep_actor=task_aware")
+    assert {row.domain: row.keep_actor for row in arm.rows} == {"walker": True, "jaco": False}
+    assert "% of Dreamer@2M" in learning_curves([arm]).caption
 
 
 @pytest.mark.parametrize(
