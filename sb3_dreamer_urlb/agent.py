@@ -26,7 +26,7 @@ class Agent(nn.Module):
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
     :param classes: number of classes of each choice that is an action; empty where actions are numbers
     :param task_reward: while exploring with a reward that the reward head learns, learn the task's beside it (paper, appendix
-        "Learning Rewards Online")
+        "Learning Rewards Online"); names of tasks: while exploring, learn the rewards of all of them, a head each
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Agent(nn.Module):
         intrinsic: IntrinsicReward | None,
         explores: bool = True,
         classes: Sequence[int] = (),
-        task_reward: bool = False,
+        task_reward: bool | Sequence[str] = False,
     ):
         super().__init__()
         sizes = world_model.sizes
@@ -56,9 +56,12 @@ class Agent(nn.Module):
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.reward_normalizer = RewardNormalizer(intrinsic.momentum if self.explores and intrinsic is not None else 1.0)
         self.task_reward: MLP | None = None
-        if task_reward and self.explores and intrinsic is not None and intrinsic.labels_replay:
-            # Everything else begins as it does without this head.
-            with th.random.fork_rng(devices=[]):
+        self.task_rewards: nn.ModuleDict | None = None
+        # Everything else begins as it does without these heads.
+        with th.random.fork_rng(devices=[]):
+            if not isinstance(task_reward, bool) and self.explores:
+                self.task_rewards = nn.ModuleDict({name: MLP(sizes.feature, net_arch) for name in task_reward})
+            elif task_reward and self.explores and intrinsic is not None and intrinsic.labels_replay:
                 self.task_reward = MLP(sizes.feature, net_arch)
 
     @property
@@ -66,8 +69,14 @@ class Agent(nn.Module):
         """What actor and critic are conditioned on, None for a method without skills."""
         return None if self.intrinsic is None else self.intrinsic.skills
 
-    def known_reward(self) -> MLP | None:
-        """The head that has learnt the task's reward; None if the only one learns the intrinsic reward."""
+    def known_reward(self, task: str | None = None) -> MLP | None:
+        """The head that has learnt the task's reward; None if the only one learns the intrinsic reward.
+
+        :param task: which of several, where several are learnt; None is returned for another one
+        """
+        if self.task_rewards is not None:
+            found = None if task is None or task not in self.task_rewards else self.task_rewards[task]
+            return found  # type: ignore[return-value]
         if self.task_reward is not None:
             return self.task_reward
         taken = self.explores and self.intrinsic is not None and self.intrinsic.labels_replay

@@ -40,6 +40,7 @@ class SequenceBatch:
     :param is_first: bool (B, T), true for an episode's first row; the first row of every chunk counts as one
     :param is_terminal: bool (B, T), true where the environment terminated (not where it was truncated)
     :param skill: float32 (B, T, W), the skill that each row's action followed; None without skills
+    :param task_rewards: float32 (B, T, K), what K tasks of the domain paid for each row; None where nobody learns them
     """
 
     observation: Observation
@@ -48,6 +49,7 @@ class SequenceBatch:
     is_first: th.Tensor
     is_terminal: th.Tensor
     skill: th.Tensor | None = None
+    task_rewards: th.Tensor | None = None
 
 
 @dataclass

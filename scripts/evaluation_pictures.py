@@ -1,7 +1,10 @@
-"""Draws the pictures of docs/evaluation.md from made-up rows, which they say: python scripts/evaluation_pictures.py"""
+"""Draws the pictures of docs/evaluation.md: python scripts/evaluation_pictures.py
+
+Tables' figures come from made-up rows, and say so; the comparison from the episodes in results/evidence."""
 
 from __future__ import annotations
 
+import csv
 import sys
 import tempfile
 from pathlib import Path
@@ -29,10 +32,38 @@ def draw(out: Path) -> None:
         curves = ["--curves", LBS, "method=dreamer,perturbation=,label=no_pre-training"]
         main(["figures", str(rows), "--out", str(figures), "--repetitions", "200", *curves])
         for path in sorted(figures.glob("*.png")):
-            # A page of them should load quickly.
-            picture = Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE)
-            picture.save(out / path.name, optimize=True)
+            shrink(path, out / path.name)
+
+
+def shrink(path: Path, target: Path) -> None:
+    """A page of pictures should load quickly."""
+    Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+def draw_comparison(out: Path) -> None:
+    """Runs of results/evidence as `compare` shows them.
+
+    :param out: folder of the picture
+    """
+    with open(ROOT / "results" / "evidence" / "episodes.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    with tempfile.TemporaryDirectory() as folder:
+        groups = {}
+        for label, arm in (("LBS, actor kept", "lbs-kept"), ("from scratch", "scratch")):
+            for run in sorted({row["run"] for row in rows if row["run"].startswith(f"run/{arm}/")}):
+                path = Path(folder) / run
+                path.mkdir(parents=True)
+                with open(path / "progress.csv", "w", newline="") as file:
+                    writer = csv.writer(file)
+                    writer.writerow(["time/total_timesteps", "rollout/ep_rew_mean"])
+                    # Two frames make a step.
+                    writer.writerows((2 * int(row["step"]), row["return"]) for row in rows if row["run"] == run)
+                groups.setdefault(label, []).append(str(path))
+        page = Path(folder) / "comparison.html"
+        main(["compare", *(f"{label}={','.join(paths)}" for label, paths in groups.items()), "--out", str(page)])
+        shrink(page.with_suffix(".png"), out / "comparison.png")
 
 
 if __name__ == "__main__":
     draw(ROOT / "docs" / "images" / "evaluation")
+    draw_comparison(ROOT / "docs" / "images" / "evaluation")

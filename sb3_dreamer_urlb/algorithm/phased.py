@@ -85,6 +85,8 @@ class PhasedAlgorithm(CollectingAlgorithm):
         self.phase_frames = 0
         #: environment frames of the pre-training that this model was fine-tuned from
         self.pretrained_frames = 0
+        #: what its fine-tuning began with, see :meth:`fine_tune`; None before, without pre-training, and of older files
+        self.kept = None
         #: skipped updates of what this model was before, in the other phase or in a file
         self._skipped_before = 0
         #: environment frames an agent step
@@ -222,7 +224,8 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
         :param keep_critic: for ablations
         :param keep_reward: begin with the task's reward head as the pre-training's rewards taught it (paper, appendix
-            "Learning Rewards Online"); it is that of the *pre-training* environment's task
+            "Learning Rewards Online"): of this environment's task, if the pre-training learnt several by name
+            (``learn_task_reward``), else that of the *pre-training* environment's task
         :raises ValueError: if the model is not pre-training, or there is no such head
         """
         if self.phase != phases.PRETRAINING:
@@ -230,16 +233,19 @@ class PhasedAlgorithm(CollectingAlgorithm):
                 f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}: "
                 "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
             )
-        if keep_reward:
-            self._check_reward_is_known()
         if env is not None:
-            before, env = self._vec_normalize_env, self.prepare_fine_tuning_env(env)
+            env = self.prepare_fine_tuning_env(env)
+        if keep_reward:
+            self._check_reward_is_known(self.env if env is None else env)
+        if env is not None:
+            before = self._vec_normalize_env
             self.set_env(env)
             normalized.carry_over(before, self._vec_normalize_env)
         if keep_actor is None:
             keep_actor = self.keeps_actor()
         pretrained = self.policy
         self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
+        self.kept = {"actor": bool(keep_actor), "critic": bool(keep_critic), "reward": bool(keep_reward)}
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
         self.replay_buffer.close()
         del self.replay_buffer
@@ -262,8 +268,9 @@ class PhasedAlgorithm(CollectingAlgorithm):
             normalized.check(self._vec_normalize_env, unwrap_vec_normalize(wrapped))
         return wrapped
 
-    def _check_reward_is_known(self) -> None:
+    def _check_reward_is_known(self, env: VecEnv | None) -> None:
         """
+        :param env: of the fine-tuning
         :raises ValueError: if the pre-training has learnt no reward head of the task
         """
         raise ValueError(f"keep_reward=True needs a reward head, and {type(self).__name__} has none.")

@@ -14,12 +14,14 @@ METHODS = ("lbs", "icm", "plan2explore", "rnd", "apt", "diayn", "aps")
 #: of the appendix on longer pre-training; the last is the paper's longest
 LONGER = (*SNAPSHOT_FRAMES, 3_000_000, 4_000_000, 5_000_000)
 ZERO_SHOT_PLANNER = "mppi_zero_shot"
+#: in the place of a method: no pre-training at all
+SCRATCH = "scratch"
 
 
 @dataclass(frozen=True)
 class PreTraining:
     """
-    :param method: intrinsic reward
+    :param method: intrinsic reward, or ``SCRATCH``, whose only length is 0
     :param env: id of the environment
     :param seed: of everything
     :param lengths: environment frames at which snapshots are taken; the last ends the run
@@ -135,6 +137,17 @@ def zero_shot(plan: Plan) -> Iterator[FineTuning]:
             yield FineTuning(start, start.lengths[-1], env, frames, keep_reward=True, planner=ZERO_SHOT_PLANNER)
 
 
+def from_scratch(plan: Plan, primal: bool) -> Iterator[FineTuning]:
+    """Beside any study: each task learnt at once, with no pre-training, for as many frames as the fine-tunings have.
+
+    :param plan: whose tasks and seeds
+    :param primal: see :meth:`Plan.each`
+    """
+    for start, domain, name in Plan((SCRATCH,), plan.tasks, plan.seeds, finetune=plan.finetune).each(primal):
+        env = env_id(domain, name) if primal else _fixed(domain, name)
+        yield FineTuning(PreTraining(SCRATCH, env, start.seed, (0,)), 0, env, plan.finetune)
+
+
 def modules(plan: Plan) -> Iterator[FineTuning]:
     """Paper, figure "Task-aware fine-tuning": model / + actor / + critic, with and without the planner."""
     for start, domain, name in plan.each():
@@ -164,28 +177,31 @@ class Manifest:
     :param runs: of a plan
     :param plan: the paper's
     :param figure: of ``figures`` that shows it
+    :param primal: it pre-trains in the primal task, not in the task itself
     """
 
     runs: Callable[[Plan], Iterator[FineTuning]]
     plan: Plan
     figure: str
+    primal: bool = True
 
 
 _JACO = tuple(f"jaco-{task}" for task in URLB_TASKS["jaco"])
 MANIFESTS: dict[str, Manifest] = {
-    "known-reward": Manifest(known_reward, Plan(), "known_reward"),
-    "zero-shot": Manifest(zero_shot, Plan(methods=("plan2explore",)), "zero_shot"),
+    "known-reward": Manifest(known_reward, Plan(), "known_reward", primal=False),
+    "zero-shot": Manifest(zero_shot, Plan(methods=("plan2explore",)), "zero_shot", primal=False),
     "modules": Manifest(modules, Plan(), "modules"),
     "longer": Manifest(longer, Plan(pretrain=LONGER), "longer_pretraining"),
     "sparsity": Manifest(sparsity, Plan(tasks=_JACO), "sparsity"),
 }
 
 
-def runs_of(name: str, plan: Plan) -> list[FineTuning]:
+def runs_of(name: str, plan: Plan, scratch: bool = False) -> list[FineTuning]:
     """All fine-tunings of a study, each once.
 
     :param name: of ``MANIFESTS``
     :param plan: what of it
+    :param scratch: and beside it agents without pre-training
     :raises ValueError: for an unknown name, or tasks that the study is not about
     """
     if name not in MANIFESTS:
@@ -193,4 +209,5 @@ def runs_of(name: str, plan: Plan) -> list[FineTuning]:
     others: Sequence[str] = [task for task in plan.tasks if task not in _JACO] if name == "sparsity" else ()
     if others:
         raise ValueError(f"The study {name} is about Jaco: it has no {', '.join(others)}.")
-    return list(dict.fromkeys(MANIFESTS[name].runs(plan)))
+    beside = from_scratch(plan, MANIFESTS[name].primal) if scratch else ()
+    return list(dict.fromkeys([*MANIFESTS[name].runs(plan), *beside]))

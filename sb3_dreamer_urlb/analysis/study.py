@@ -13,9 +13,9 @@ from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
-from sb3_dreamer_urlb.analysis.manifests import FineTuning, PreTraining
+from sb3_dreamer_urlb.analysis.manifests import SCRATCH, FineTuning, PreTraining
 from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
 from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -23,6 +23,7 @@ from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import append_row
 from sb3_dreamer_urlb.evaluation.episodes import EPISODES, run_evaluation
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize, save_vec_normalize
 
 
 @dataclass
@@ -66,6 +67,8 @@ class StudyFolder:
 
         :param start: the run
         """
+        if start.method == SCRATCH:
+            return
         last, folder = self.snapshot(start, start.lengths[-1]), self.path / "runs" / start.name
         if last.exists():
             shutil.rmtree(folder, ignore_errors=True)
@@ -89,10 +92,10 @@ class StudyFolder:
         :param run: whose pre-training is finished
         """
         env, folder = self.make_env(run.env, 1), self.path / "runs" / run.name.replace("/", "_")
-        device = self.arguments.get("device", "auto")
-        model = DreamerV2.load(self.snapshot(run.start, run.length), env=env, device=device, planner=run.planner)
-        model.fine_tune(keep_actor=run.keep_actor, keep_critic=run.keep_critic, keep_reward=run.keep_reward)
-        model.num_timesteps = 0
+        if isinstance(env, VecNormalize) and run.start.method != SCRATCH:
+            # What the model knows of the world, it knows through these.
+            env = load_vec_normalize(beside(self.snapshot(run.start, run.length)), env.venv, training=True)
+        model = self._begin(run, env)
         if run.frames:
             steps = -(-run.frames // model.action_repeat)
             model.learn(steps, callback=RunCheckpointCallback(folder, resume="auto"))
@@ -100,12 +103,26 @@ class StudyFolder:
         target.parent.mkdir(parents=True, exist_ok=True)
         model.save(target)
         played_in = self.make_env(run.env, min(self.episodes, 10))
+        if isinstance(env, VecNormalize):
+            save_vec_normalize(env, beside(target))
+            sync_envs_normalization(env, played_in)
         played = run_evaluation(model, played_in, self.episodes, planner="off" if run.planner is None else "on")
-        columns = {"run_folder": run.name, "known_reward": "true" if run.keep_reward else "false"}
-        append_row(self.rows, row_of(model, played_in, played, run.keep_actor, run.keep_critic, **columns))
+        columns: dict[str, Any] = {"run_folder": run.name, "known_reward": "true" if run.keep_reward else "false"}
+        append_row(self.rows, row_of(model, played_in, played, **columns))
         for one in (env, played_in):
             one.close()
         shutil.rmtree(folder, ignore_errors=True)
+
+    def _begin(self, run: FineTuning, env: VecEnv) -> DreamerV2:
+        """The agent with which a fine-tuning begins."""
+        if run.start.method == SCRATCH:
+            arguments = {**self.arguments, "seed": run.start.seed, "planner": run.planner}
+            return DreamerV2(_policy(env), env, **arguments)
+        device = self.arguments.get("device", "auto")
+        model = DreamerV2.load(self.snapshot(run.start, run.length), env=env, device=device, planner=run.planner)
+        model.fine_tune(keep_actor=run.keep_actor, keep_critic=run.keep_critic, keep_reward=run.keep_reward)
+        model.num_timesteps = 0
+        return model
 
     # -- all of them ---------------------------------------------------------------------------------------------------
 
@@ -125,7 +142,7 @@ class StudyFolder:
                 if mine:
                     self.pretrain(run.start)
                     self._check_there(run)
-            if not self.snapshot(run.start, run.length).exists():
+            if run.start.method != SCRATCH and not self.snapshot(run.start, run.length).exists():
                 # Another process is at it.
                 continue
             with self._locked(run.name) as mine:
@@ -136,7 +153,7 @@ class StudyFolder:
         return count
 
     def _check_there(self, run: FineTuning) -> None:
-        if not self.snapshot(run.start, run.length).exists():
+        if run.start.method != SCRATCH and not self.snapshot(run.start, run.length).exists():
             raise ValueError(
                 f"{self.path} holds the pre-training {run.start.name} without a snapshot at {run.length} frames: "
                 "other lengths need another folder."
@@ -161,3 +178,12 @@ def _policy(env: VecEnv) -> str:
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"
     return "CnnPolicy" if isinstance(space, spaces.Box) and len(space.shape) == 3 else "MlpPolicy"
+
+
+def normalized_states(env_id: str, count: int) -> VecEnv:
+    """Environments that show dm_control's own numbers, normalised: cheap enough for CPU cores.
+
+    :param env_id: id
+    :param count: how many
+    """
+    return VecNormalize(make_vec_env(env_id, count, env_kwargs={"observation": "state"}), norm_reward=False)

@@ -23,7 +23,7 @@ def check_pretrained(model: DreamerV2) -> None:
     check_has_model(model)
     if model.phase != PRETRAINING:
         raise ValueError(f"Zero-shot planning needs a pre-trained snapshot, this one is in the phase {model.phase!r}.")
-    model._check_reward_is_known()
+    model._check_reward_is_known(model.get_env())
 
 
 def prepare_zero_shot(model: DreamerV2, finetune_frames: int = 0) -> DreamerV2:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
@@ -43,7 +42,7 @@ class EvaluationCallback(EvalCallback):
     :param planner: ``"auto"`` as the agent acts at that time, ``"on"``, ``"off"``, or ``"both"``: a row with the planner, if
         the model has one, and a row of the actor alone. ``evaluations.npz`` and ``eval/mean_reward`` have the first
     :param pretraining: evaluate while pre-training, too
-    :param keep_actor: for the rows; None takes what the callback that switches the phase says, or the rule of the paper
+    :param keep_actor: for the rows; None takes what the model knows of its own fine-tuning
     :param keep_critic: likewise
     :param columns: further columns of the rows, such as ``{"arm": "no bonus"}``
     :param seed: of the first episode
@@ -90,7 +89,6 @@ class EvaluationCallback(EvalCallback):
         self.columns = dict(columns or {})
         self.seed = seed
         self._due: tuple[str, int] = ("", 0)
-        self._beside: Sequence[BaseCallback] = ()
 
     @property
     def _dreamer(self) -> DreamerV2:
@@ -114,11 +112,6 @@ class EvaluationCallback(EvalCallback):
             raise ValueError("planner='on': the model has none.")
         # An evaluation that was due before the run was cut off has been.
         self._due = (self._dreamer.phase, self._dreamer.phase_frames // self.every_frames)
-
-    def _on_training_start(self) -> None:
-        # What ``learn`` was given, under SB3's name and under ours.
-        given = self.locals.get("callbacks", self.locals.get("callback"))
-        self._beside = getattr(given, "callbacks", ())
 
     def _on_step(self) -> bool:
         model = self._dreamer
@@ -152,21 +145,11 @@ class EvaluationCallback(EvalCallback):
             return
         run = self._dreamer.run_folder
         columns = {**({} if run is None else {"run_folder": run.path}), **self.columns}
-        keep_actor, keep_critic = self._kept()
         try:
-            append_row(self.rows, row_of(self.model, self.eval_env, evaluation, keep_actor, bool(keep_critic), **columns))
+            append_row(self.rows, row_of(self.model, self.eval_env, evaluation, self.keep_actor, self.keep_critic, **columns))
         except RowsDisagree as error:
             # The first result stands, and hours of training are not thrown away for the second.
             warnings.warn(str(error))
-
-    def _kept(self) -> tuple[bool | None, bool | None]:
-        """What the row says about the fine-tuning: as given, or as the callback beside this one has it."""
-        kept = [self.keep_actor, self.keep_critic]
-        for callback in self._beside:
-            for i, name in enumerate(("keep_actor", "keep_critic")):
-                if callback is not self and kept[i] is None:
-                    kept[i] = getattr(callback, name, None)
-        return kept[0], kept[1]
 
     def _log(self, evaluation: Evaluation) -> bool:
         self.evaluations_timesteps.append(self.num_timesteps)

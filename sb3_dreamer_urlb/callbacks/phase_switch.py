@@ -55,12 +55,13 @@ class PhaseSwitchCallback(BaseCallback):
             warnings.warn(
                 "PhaseSwitchCallback has nothing to switch: with intrinsic_reward=None the model learns the task at once."
             )
+        # Now, not after the 2M frames of pre-training.
+        if self.env is not None:
+            self.env = model.prepare_fine_tuning_env(self.env) if model.phase == PRETRAINING else model.prepare_env(self.env)
         if self.keep_reward and model.phase == PRETRAINING:
-            model._check_reward_is_known()
+            model._check_reward_is_known(self.env or model.env)
         if self.env is None:
             return
-        # Now, not after the 2M frames of pre-training.
-        self.env = model.prepare_fine_tuning_env(self.env) if model.phase == PRETRAINING else model.prepare_env(self.env)
         resumed = model.run_folder is not None and model.run_folder.resumed
         if resumed and model.phase != PRETRAINING and model.get_env() is not self.env:
             # The run was resumed after the switch, with the pre-training's environment.

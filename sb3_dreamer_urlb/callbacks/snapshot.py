@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, save_vec_normalize
 
 #: when the paper saves its pre-trained agents, in environment frames
 SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
@@ -18,7 +20,8 @@ SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
 class SnapshotCallback(BaseCallback):
     """Save the pre-training agent whenever it has seen given numbers of frames (paper §2).
 
-    Files are called ``<name_prefix>_<frames>.zip``.
+    Files are called ``<name_prefix>_<frames>.zip``; beside each, where the environment is a ``VecNormalize``, its statistics:
+    ``<name_prefix>_<frames>.vec_normalize.json``.
 
     :param save_path: folder, made if it does not exist
     :param frames: when, in environment frames of the pre-training
@@ -54,6 +57,8 @@ class SnapshotCallback(BaseCallback):
         while self.pending and model.phase_frames >= self.pending[0]:
             path = os.path.join(self.save_path, f"{self.name_prefix}_{self.pending.pop(0)}.zip")
             model.save(path)
+            if (normalizer := model.get_vec_normalize_env()) is not None:
+                save_vec_normalize(normalizer, beside(Path(path)))
             if self.verbose >= 1:
                 print(f"Saved {path}")
         return True

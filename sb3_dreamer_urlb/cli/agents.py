@@ -7,9 +7,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-#: ending of the file of statistics that belongs to a snapshot
-BESIDE = ".vec_normalize.json"
-
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -36,7 +33,7 @@ def add_statistics_argument(parser: argparse.ArgumentParser, whose: str = "") ->
         f"--{whose}-vec-normalize" if whose else "--vec-normalize",
         type=Path,
         help=f"statistics of the {whose + ' ' if whose else ''}observations, JSON (default: a run folder's own, or "
-        f"NAME{BESIDE} beside NAME.zip)",
+        "NAME.vec_normalize.json beside NAME.zip)",
     )
 
 
@@ -80,26 +77,17 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
     from stable_baselines3.common.env_util import make_vec_env
 
     from sb3_dreamer_urlb.evaluation.loading import normalized_as_saved
-    from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
+    from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 
     kwargs = {name: typed(value) for name, value in pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
     snapshot = _file(options["snapshot"])
     env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
     try:
-        statistics = options.get("vec_normalize") or statistics_beside(snapshot)
+        statistics = options.get("vec_normalize") or (beside(snapshot) if beside(snapshot).is_file() else None)
         return normalized_as_saved(env, snapshot) if statistics is None else load_vec_normalize(statistics, env)
     except BaseException:
         env.close()
         raise
-
-
-def statistics_beside(snapshot: Path) -> Path | None:
-    """The file of statistics that lies beside a snapshot, if there is one.
-
-    :param snapshot: ``NAME.zip``
-    """
-    found = snapshot.with_name(snapshot.name.removesuffix(".zip") + BESIDE)
-    return found if found.is_file() else None
 
 
 def _file(snapshot: Path) -> Path:

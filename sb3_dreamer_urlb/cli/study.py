@@ -21,11 +21,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--folder", type=Path, required=True, help="of the study: rows.csv, snapshots, runs under way")
     parser.add_argument("--methods", nargs="+", help="intrinsic rewards (default: the paper's)")
     parser.add_argument("--tasks", nargs="+", help="such as walker-run (default: the paper's)")
+    parser.add_argument("--scratch", action="store_true", help="beside it, agents that learn each task without pre-training")
     parser.add_argument("--seeds", type=int, help="how many (default: 3)")
     parser.add_argument("--pretrain-frames", type=int, nargs="+", help="lengths of the pre-training (default: the paper's)")
     parser.add_argument("--finetune-frames", type=int, help="(default: 100000)")
     parser.add_argument("--episodes", type=int, default=10, help="of an evaluation (default: %(default)s)")
     parser.add_argument("--preset", default="paper", help="of the models (default: %(default)s)")
+    choices = ("pixels", "state")
+    parser.add_argument(
+        "--observation",
+        choices=choices,
+        default=choices[0],
+        help="state: normalised, with --preset state-small (default: pixels)",
+    )
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
     parser.add_argument("--at-most", type=int, help="fine-tunings")
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
@@ -39,8 +47,10 @@ def run(options: dict[str, Any]) -> int:
     """
     from dataclasses import replace
 
+    from stable_baselines3.common.env_util import make_vec_env
+
     from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, runs_of
-    from sb3_dreamer_urlb.analysis.study import StudyFolder
+    from sb3_dreamer_urlb.analysis.study import StudyFolder, normalized_states
     from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
     from sb3_dreamer_urlb.number_checks import check_integer
 
@@ -51,8 +61,10 @@ def run(options: dict[str, Any]) -> int:
     plan = replace(manifest.plan, **given)
     for method in plan.methods:
         make_intrinsic_reward(method)
-    runs = runs_of(options["name"], plan)
-    study = StudyFolder(options["folder"], {"preset": options["preset"], "device": options["device"]}, options["episodes"])
+    runs = runs_of(options["name"], plan, options["scratch"])
+    arguments = {"preset": options["preset"], "device": options["device"]}
+    make_env = normalized_states if options["observation"] == "state" else make_vec_env
+    study = StudyFolder(options["folder"], arguments, options["episodes"], make_env)
     if options["action"] == "list":
         missing = set(study.missing(runs))
         for one in runs:

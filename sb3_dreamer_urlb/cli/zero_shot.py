@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb.cli.agents import (
-    BESIDE,
     add_evaluation_arguments,
     add_statistics_argument,
     environment_of,
@@ -28,6 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("snapshot", type=Path, help="pre-trained, in the environment of the task or with its reward")
     add_evaluation_arguments(parser)
     parser.add_argument(
+        "--planner",
+        choices=("mppi_zero_shot", "mppi"),
+        default="mppi_zero_shot",
+        help="the paper's numbers, or the snapshot's own, for small machines (default: %(default)s)",
+    )
+    parser.add_argument(
         "--finetune-frames", type=int, default=0, help="then fine-tune so long, and evaluate again (paper: 100000)"
     )
     parser.add_argument("--freeze-decoder", action="store_true", help="while fine-tuning, for the latent dynamics discrepancy")
@@ -44,7 +49,7 @@ def run(options: dict[str, Any]) -> int:
     :raises ValueError: for options that do not fit the snapshot or each other
     :raises FileNotFoundError: if there is no snapshot
     """
-    from sb3_dreamer_urlb.analysis.zero_shot import PLANNER, check_pretrained, prepare_zero_shot
+    from sb3_dreamer_urlb.analysis.zero_shot import check_pretrained, prepare_zero_shot
     from sb3_dreamer_urlb.evaluation.agent_rows import row_of
     from sb3_dreamer_urlb.evaluation.append import append_row
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
@@ -60,7 +65,7 @@ def run(options: dict[str, Any]) -> int:
     if "rows" in options and first.seed is None:
         raise ValueError("The model has no seed, and rows tell runs apart by it: load it, give it one, and save it again.")
     for frames in dict.fromkeys((0, options["finetune_frames"])):
-        model, train_env = load_agent(options, 1, planner=PLANNER, freeze_decoder=options["freeze_decoder"])
+        model, train_env = load_agent(options, 1, planner=options["planner"], freeze_decoder=options["freeze_decoder"])
         prepare_zero_shot(model, frames)
         env = environment_of(options, envs)
         played = run_evaluation(model, env, options["episodes"], options["seed"], "on")
@@ -82,8 +87,8 @@ def save(model: DreamerV2, path: Path) -> None:
     :param model: in its environment
     :param path: of the snapshot
     """
-    from sb3_dreamer_urlb.hub.statistics import save_vec_normalize
+    from sb3_dreamer_urlb.snapshots.vec_normalize import beside, save_vec_normalize
 
     model.save(path)
     if (normalizer := model.get_vec_normalize_env()) is not None:
-        save_vec_normalize(normalizer, path.with_name(path.name.removesuffix(".zip") + BESIDE))
+        save_vec_normalize(normalizer, beside(path))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
@@ -94,14 +95,36 @@ def check(model: SavedAlgorithm) -> None:
         checks.check_rate(name, getattr(given, name))
     if given.discount_head is not None and not isinstance(given.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
-    for name in ("overlap", "reward_trains_model", "learn_task_reward", "freeze_decoder"):
+    for name in ("overlap", "reward_trains_model", "freeze_decoder"):
         checks.check_switch(name, getattr(given, name))
+    _check_tasks(given.learn_task_reward)
     checks.check_noise(model)
     _check_names(given, model.phase)
     checks.check_policy_kwargs(model, POLICY_ARGUMENTS_OF_THE_MODEL)
     _check_spaces(given, model)
     if model.env is not None:
         check_episodes_fit(given.batch_length, model.replay_buffer_kwargs, model.env)
+
+
+def _check_tasks(tasks: Any) -> None:
+    names = isinstance(tasks, list | tuple) and tasks and all(isinstance(name, str) and name.isidentifier() for name in tasks)
+    if not (isinstance(tasks, bool) or (names and len(set(tasks)) == len(tasks))):
+        raise ValueError(f"learn_task_reward must be True, False, or a list of names of tasks, each once, got {tasks!r}.")
+
+
+def check_tasks_are_told(tasks: Sequence[str], env: VecEnv) -> None:
+    """Whether an environment lets the rewards of several tasks be learnt, as far as it can be known before it steps.
+
+    :param tasks: names
+    :param env: to pre-train in
+    :raises ValueError: if it normalises rewards: the others' have statistics of their own
+    """
+    normalizer = unwrap_vec_normalize(env)
+    if tasks and normalizer is not None and normalizer.norm_reward:
+        raise ValueError(
+            f"learn_task_reward={list(tasks)!r} learns rewards as they are: wrap the environment in "
+            "VecNormalize(norm_reward=False)."
+        )
 
 
 def _check_names(given: SimpleNamespace, phase: str) -> None:
@@ -117,7 +140,7 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
     checks.check_method(method, phase)
     for name in ("learn_task_reward", "freeze_decoder"):
         if getattr(given, name) and method is None:
-            raise ValueError(f"{name}=True needs a pre-training, got intrinsic_reward=None.")
+            raise ValueError(f"{name}={getattr(given, name)!r} needs a pre-training, got intrinsic_reward=None.")
     make_planner(given.planner, given.planner_kwargs, given.gae_lambda, classes=None)
     buffer_class = given.replay_buffer_class
     if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):

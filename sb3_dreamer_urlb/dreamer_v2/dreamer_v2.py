@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb import native, phases
+from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
@@ -23,6 +24,7 @@ from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
+from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.planning import Planner, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.spaces.actions import make_actions
@@ -77,7 +79,8 @@ class DreamerV2(AgentAlgorithm):
         fine-tuning of DIAYN and APS (docs/algorithm.md)
     :param learn_task_reward: for ICM and RND, whose reward head learns their own reward: let a second head learn the
         environment's beside it while pre-training, for ``fine_tune(keep_reward=True)``. The one head of every other method
-        learns it in any case
+        learns it in any case. Names of tasks, ``["stand", "walk"]``: learn the rewards of each in a head of its own, with any
+        method, in an environment made with ``domain_rewards=True``; the fine-tuning's task then chooses one
     :param freeze_decoder: let the decoder keep its pre-trained weights in fine-tuning (paper, appendix "Latent Dynamics
         Discrepancy")
     :param warmup_actions: of the pre-training before its first update: ``"uniform"`` in the action space; ``"saturated"``, the
@@ -152,7 +155,7 @@ class DreamerV2(AgentAlgorithm):
         kl_scale: float = 1.0,
         actor_gradient: str = AUTO,
         reward_trains_model: bool = True,
-        learn_task_reward: bool = False,
+        learn_task_reward: bool | Sequence[str] = False,
         freeze_decoder: bool = False,
         warmup_actions: str = arguments.UNIFORM,
         target_update_interval: int = 100,
@@ -332,10 +335,16 @@ class DreamerV2(AgentAlgorithm):
                 "seed": self.seed,
                 "phase": self.phase,
                 "skill_size": self.skill_size,
+                **({"tasks": tuple(tasks)} if (tasks := self.tasks_learnt()) else {}),
                 **self.replay_buffer_kwargs,
             },
         )
         return buffer
+
+    def tasks_learnt(self) -> Sequence[str]:
+        """Tasks whose rewards are learnt beside the exploration, in the current phase; empty without any."""
+        named = not isinstance(self.learn_task_reward, bool) and phases.PHASES[self.phase].explores
+        return self.learn_task_reward if named else ()  # type: ignore[return-value]
 
     # -- acting --------------------------------------------------------------------------------------------------------
 
@@ -358,16 +367,24 @@ class DreamerV2(AgentAlgorithm):
 
     # -- phases --------------------------------------------------------------------------------------------------------
 
-    def _check_reward_is_known(self) -> None:
-        if self.policy.agent.known_reward() is None:
+    def _check_reward_is_known(self, env: VecEnv | None) -> None:
+        agent = self.policy.agent
+        if _known_reward(agent, env) is not None:
+            return
+        if agent.task_rewards is not None:
+            learnt, task = ", ".join(agent.task_rewards), None if env is None else env_fact(env, "task", None)
             raise ValueError(
-                f"keep_reward=True: the reward head of this pre-training learnt the reward of {self.intrinsic_reward!r}, "
-                "not the task's. Pre-train with learn_task_reward=True, which adds a head for it."
+                f"keep_reward=True: this pre-training learnt the rewards of {learnt}; the environment's task is {task!r}."
             )
+        raise ValueError(
+            f"keep_reward=True: the reward head of this pre-training learnt the reward of {self.intrinsic_reward!r}, "
+            "not the task's. Pre-train with learn_task_reward=True, which adds a head for it."
+        )
 
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DreamerPolicy)
-        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic, keep_reward)
+        known = _known_reward(pretrained.agent, self.env) if keep_reward else None
+        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic, known)
 
     def fix_skill(self, skill: int | np.ndarray | None) -> None:
         """Follow one skill from now on, in training as in ``predict`` (DIAYN, APS).
@@ -415,6 +432,8 @@ class DreamerV2(AgentAlgorithm):
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
+        if self.env is not None:
+            arguments.check_tasks_are_told(self.tasks_learnt(), self.env)
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -429,3 +448,9 @@ class DreamerV2(AgentAlgorithm):
     def _learning_rates(self, remaining: float) -> dict[str, float]:
         rates = {"actor_optimizer": self._actor_lr_schedule, "critic_optimizer": self._critic_lr_schedule}
         return {name: rates.get(name, self.lr_schedule)(remaining) for name in self.learner.optimizers()}
+
+
+def _known_reward(agent: Agent, env: VecEnv | None) -> MLP | None:
+    """The head that knows the reward of an environment's task."""
+    several = agent.task_rewards is not None and env is not None
+    return agent.known_reward(env_fact(env, "task", None) if several else None)  # type: ignore[arg-type]

@@ -70,7 +70,8 @@ class DreamerPolicy(AgentPolicy[ActingState]):
     :param discount_head: learn which states terminate
     :param intrinsic: what the agent explores with, not yet built; None for an agent that learns a task
     :param explores: the intrinsic reward drives the actor; False leaves only its skills in use
-    :param task_reward: while exploring with ICM or RND, learn the task's reward in a head of its own
+    :param task_reward: while exploring with ICM or RND, learn the task's reward in a head of its own; names of tasks: those of
+        all of them, with any method
     :param planner: what acts instead of the actor while ``planning`` is true
     :param planning: let the planner act
     :param precision: of the planner's products, see :class:`~sb3_dreamer_urlb.DreamerV2`; all else here is float32
@@ -97,7 +98,7 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         discount_head: bool = False,
         intrinsic: IntrinsicReward | None = None,
         explores: bool = True,
-        task_reward: bool = False,
+        task_reward: bool | Sequence[str] = False,
         planner: Planner | None = None,
         planning: bool = True,
         precision: str = "float32",
@@ -147,7 +148,8 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         )
         parameters.update(precision=self.precision, compile=self.compile_mode)
         parameters.update(intrinsic=self.intrinsic, explores=self.agent.explores)
-        parameters.update(task_reward=self.agent.task_reward is not None)
+        tasks = self.agent.task_rewards
+        parameters.update(task_reward=self.agent.task_reward is not None if tasks is None else list(tasks))
         return parameters
 
     @property

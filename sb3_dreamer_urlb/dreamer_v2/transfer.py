@@ -5,6 +5,7 @@ from __future__ import annotations
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.algorithm.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
 from sb3_dreamer_urlb.algorithm.transfer import transfer as transfer_parts
+from sb3_dreamer_urlb.nn.nets import MLP
 
 #: What a fine-tuning takes over from the pre-trained agent (docs/algorithm.md, "Transfer"). Optimisers and replay always
 #: stay behind, and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
@@ -26,17 +27,15 @@ TRANSFER: dict[str, str] = {
 SKILL_STATES = 4096
 
 
-def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool, keep_reward: bool = False) -> None:
+def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool, known_reward: MLP | None = None) -> None:
     """Copy what ``TRANSFER`` keeps from one agent into a fresh one of the same sizes; the task's reward head if it is known.
 
     :param source: pre-trained
     :param target: fresh; changed in place
     :param keep_actor: see ``TRANSFER``
     :param keep_critic: see ``TRANSFER``
-    :param keep_reward: begin with the task's reward head, which the source must have
+    :param known_reward: begin with this reward head, the source's of the task
     """
     transfer_parts(source, target, TRANSFER, keep_actor, keep_critic)
-    if keep_reward:
-        known = source.known_reward()
-        assert known is not None
-        target.world_model.reward.load_state_dict(known.state_dict())
+    if known_reward is not None:
+        target.world_model.reward.load_state_dict(known_reward.state_dict())

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 
+from sb3_dreamer_urlb.envs.domain_rewards import KEY, DomainRewards
 from sb3_dreamer_urlb.envs.options import PixelOptions
 from sb3_dreamer_urlb.envs.rendering import claim_renderer, load_physics
 
@@ -48,7 +49,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
 
     Actions are float32 (A,) in [-1, 1], mapped linearly to the task's bounds; values outside go through and MuJoCo clamps
     them. The reward is the sum over the control steps of one action, a float. ``info["task_reward"]`` holds it too, also
-    when ``reward_free``.
+    when ``reward_free``. With ``domain_rewards``, ``info["domain_rewards"]`` has such a sum for each task of the domain.
 
     ``reset(seed=s)`` seeds everything the task draws; without a seed its stream goes on (a fresh one starts from the
     system's entropy). It does not seed ``action_space``.
@@ -90,6 +91,8 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self._shimmy = ShimmyEnv(control_env)
         #: what steps it in place of itself, if it is perturbed: see ``perturbed_control``
         self.perturbed: PerturbedControl | None = None
+        #: tells what each task of the domain would pay; None where nobody asks
+        self.domain_rewards: DomainRewards | None = None
         self._was_reset, self._episode_over, self._closed = False, True, False
 
         spec = control_env.action_spec()
@@ -149,17 +152,24 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
             raise ResetNeeded(f"{self}: call reset() before step(): no episode is running.")
         control_action = self._to_control(action)
         task_reward, terminated, truncated = 0.0, False, False
+        others: dict[str, float] = {}
         for _ in range(self.action_repeat):
             with self._named_physics_errors():
                 # dm_control's time limits leave the discount at 1: Shimmy calls that truncated.
                 observed, reward, terminated, truncated, _ = self._shimmy.step(control_action)
             task_reward += float(reward)
+            if self.domain_rewards is not None:
+                paid = self.domain_rewards((self.perturbed or self._control).physics)
+                others = {name: others.get(name, 0.0) + value for name, value in paid.items()}
             if terminated or truncated:
                 self._episode_over = True
                 break
         observation = self._observe(observed)
         reward = 0.0 if self._options.reward_free else task_reward
-        return observation, reward, terminated, truncated, {"task_reward": task_reward}
+        info: dict[str, Any] = {"task_reward": task_reward}
+        if self.domain_rewards is not None:
+            info[KEY] = others
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The present state, drawn for people: of ``render_size``, whatever the size of the observations.

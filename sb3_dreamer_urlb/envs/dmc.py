@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from sb3_dreamer_urlb.envs import perturbations as rwrl
+from sb3_dreamer_urlb.envs.domain_rewards import DomainRewards, check_domain
 from sb3_dreamer_urlb.envs.options import PixelOptions, refuse_unknown
 from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
 from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task
@@ -35,6 +36,7 @@ def make_urlb_env(
     render_size: int = 256,
     observation: str = "pixels",
     perturbations: Perturbations | Mapping[str, Any] | None = None,
+    domain_rewards: bool = False,
     **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """One of the twelve tasks of the benchmark. The defaults are the paper's ("Mastering the Unsupervised Reinforcement
@@ -52,6 +54,8 @@ def make_urlb_env(
     :param observation: ``"pixels"``, ``"state"`` or ``"both"``
     :param perturbations: of the Real-World RL suite, or their arguments by name; see
         :class:`~sb3_dreamer_urlb.envs.perturbations.Perturbations`
+    :param domain_rewards: tell what each task of the domain would have paid, in ``info["domain_rewards"]``, task → reward,
+        without any delay; walker and quadruped only
     :param unknown: options that there are not
     :return: observations uint8 (image_size, image_size, 3), or float32 (N,) for ``"state"``, or a Dict of both,
         ``"image"`` and ``"state"``; actions float32 (A,) in [-1, 1]. See
@@ -73,6 +77,7 @@ def make_urlb_env(
         render_size=render_size,
         observation=observation,
         perturbations=perturbations,
+        domain_rewards=domain_rewards,
         **unknown,
     )
 
@@ -90,6 +95,7 @@ def make_dmc_env(
     render_size: int = 256,
     observation: str = "pixels",
     perturbations: Perturbations | Mapping[str, Any] | None = None,
+    domain_rewards: bool = False,
     **unknown: Any,
 ) -> gymnasium.Env[Any, Any]:
     """Any task of dm_control's suite, any of ``dm_control.manipulation``, or one of the benchmark's.
@@ -106,12 +112,18 @@ def make_dmc_env(
     :param observation: ``"pixels"``, ``"state"`` or ``"both"``
     :param perturbations: of the Real-World RL suite, or their arguments by name; see
         :class:`~sb3_dreamer_urlb.envs.perturbations.Perturbations`
+    :param domain_rewards: tell what each task of the domain would have paid, in ``info["domain_rewards"]``, task → reward,
+        without any delay; walker and quadruped only
     :param unknown: options that there are not
     :return: as :func:`make_urlb_env`
     :raises ValueError: naming a wrong option, its value and what was expected
     :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
-    refuse_unknown(unknown, "domain", "task", "perturbations")
+    refuse_unknown(unknown, "domain", "task", "perturbations", "domain_rewards")
+    if not isinstance(domain_rewards, bool):
+        raise ValueError(f"domain_rewards={domain_rewards!r}: expected True or False")
+    if domain_rewards:
+        check_domain(domain, task)
     options = PixelOptions(
         image_size=image_size,
         action_repeat=action_repeat,
@@ -125,7 +137,8 @@ def make_dmc_env(
     perturbed_by = make_perturbations(perturbations)
     if perturbed_by is not None:
         perturbed_by.limb(domain)  # before anything is loaded
-    return _show(options, perturbed_by, domain, task, functools.partial(make_control_env, domain, task))
+    make_control = functools.partial(make_control_env, domain, task)
+    return _show(options, perturbed_by, domain, task, make_control, domain_rewards)
 
 
 def make_rwrl_env(
@@ -173,6 +186,7 @@ def _show(
     domain: str,
     task: str,
     make_control: Callable[[], control.Environment | composer.Environment],
+    domain_rewards: bool = False,
 ) -> gymnasium.Env[Any, Any]:
     """A control environment as an agent sees it.
 
@@ -181,6 +195,7 @@ def _show(
     :param domain: of the task
     :param task: its name
     :param make_control: makes the bare environment
+    :param domain_rewards: tell those of the domain's other tasks, too
     """
     if options.observation != "state":
         load_renderer()  # at once, for the one clear error; states load one when somebody renders them
@@ -190,6 +205,8 @@ def _show(
         options = dataclasses.replace(options, render_mode="rgb_array")
     is_urlb = task in URLB_TASKS.get(domain, ()) or (domain == "jaco" and task in JACO_VARIANT_TASKS)
     env = _kind_of_env(options.observation)(control_env, options, domain=domain, task=task, never_terminates=is_urlb)
+    if domain_rewards:
+        env.domain_rewards = DomainRewards(domain)
     if perturbed_by is not None:
         from sb3_dreamer_urlb.envs.perturbation_wrapper import perturb
 

@@ -21,6 +21,7 @@ FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "action_repeat": (_is_count, "a positive integer, environment frames an agent step"),
     "domain": (lambda value: isinstance(value, str), "the name of a domain"),
     "max_episode_steps": (_is_count, "a positive integer, agent steps an episode"),
+    "task": (lambda value: isinstance(value, str), "the name of a task"),
     "never_terminates": (lambda value: isinstance(value, bool), "True or False"),
 }
 

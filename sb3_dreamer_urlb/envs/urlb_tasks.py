@@ -30,12 +30,17 @@ _FLIP_MOMENTUM = 5.0  # kg m²/s about +y at which the flip term is 1
 _JUMP_HEIGHT = 1.0  # height of the centre of mass in metres at which the jump term is 1
 
 
+def angular_momentum(physics: walker.Physics) -> float:
+    """Of the walker's whole body about its centre of mass and the world's y axis, in kg m²/s."""
+    return float(physics.named.data.subtree_angmom["torso"][1])
+
+
 class FlipPhysics(walker.Physics):
     """The walker's physics, which also tells how fast the body spins."""
 
     def angular_momentum(self) -> float:
-        """Angular momentum of the whole body about its centre of mass and the world's y axis, in kg m²/s."""
-        return float(self.named.data.subtree_angmom["torso"][1])
+        """Of the whole body about its centre of mass and the world's y axis, in kg m²/s."""
+        return angular_momentum(self)
 
 
 class Flip(walker.PlanarWalker):
@@ -44,10 +49,10 @@ class Flip(walker.PlanarWalker):
     def __init__(self) -> None:
         super().__init__(move_speed=0)  # the parent's reward is then that for standing
 
-    def get_reward(self, physics: FlipPhysics) -> float:
+    def get_reward(self, physics: walker.Physics) -> float:
         """stand · (5·flip + 1) / 6, in [0, 1]."""
         flip = rewards.tolerance(
-            physics.angular_momentum(),
+            angular_momentum(physics),
             bounds=(_FLIP_MOMENTUM, np.inf),
             margin=_FLIP_MOMENTUM,
             value_at_margin=0,

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 from sb3_dreamer_urlb.evaluation.names import columns_of_id
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row
-from sb3_dreamer_urlb.phases import PHASES, keeps_actor
+from sb3_dreamer_urlb.phases import PHASES
 
 #: classes of algorithms → what a run of theirs without pre-training is called
 FROM_SCRATCH = {"DreamerV2": "dreamer", "DrQv2": "drqv2"}
@@ -24,7 +24,7 @@ def row_of(
     env: VecEnv,
     evaluation: Evaluation,
     keep_actor: bool | None = None,
-    keep_critic: bool = False,
+    keep_critic: bool | None = None,
     **columns: Any,
 ) -> Row:
     """One row about an evaluation.
@@ -32,7 +32,8 @@ def row_of(
     :param model: that was evaluated
     :param env: that it was evaluated in
     :param evaluation: what came of it
-    :param keep_actor: whether its fine-tuning began with the pre-trained actor; None takes the rule of the paper (§3)
+    :param keep_actor: whether its fine-tuning began with the pre-trained actor; None takes what the model knows, which is
+        nothing if it comes from a file of version 3 or older
     :param keep_critic: likewise for the critic
     :param columns: further columns, or other values for required ones
     """
@@ -53,8 +54,8 @@ def row_of(
     return Row(**facts, further=further)
 
 
-def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool = False) -> dict[str, Any]:
-    """What a model tells about itself: method, seed, frames, what it kept, preset, algorithm.
+def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool | None = None) -> dict[str, Any]:
+    """What a model tells about itself: method, seed, frames, what it kept, preset, algorithm; ``known_reward`` if it was.
 
     :param model: any of Stable-Baselines3
     :param keep_actor: see :func:`row_of`
@@ -70,18 +71,17 @@ def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool 
     else:
         method = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
     tuned = pretrained > 0 and not exploring
-    if tuned and keep_actor is None:
-        rule = getattr(model, "keeps_actor", None)
-        keep_actor = keeps_actor(getattr(model, "domain", None)) if rule is None else rule()
+    kept = getattr(model, "kept", None) or {}
     return {
         "method": method,
         "seed": -1 if model.seed is None else model.seed,
         "pretrain_frames": pretrained,
         "finetune_frames": 0 if exploring else frames,
-        "keep_actor": keep_actor if tuned else None,
-        "keep_critic": keep_critic if tuned else None,
+        "keep_actor": (kept.get("actor") if keep_actor is None else keep_actor) if tuned else None,
+        "keep_critic": (kept.get("critic") if keep_critic is None else keep_critic) if tuned else None,
         "preset": getattr(model, "preset", ""),
         "algorithm": algorithm,
+        **({"known_reward": "true"} if tuned and kept.get("reward") else {}),
     }
 
 

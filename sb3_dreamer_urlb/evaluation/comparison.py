@@ -12,6 +12,8 @@ from sb3_dreamer_urlb.evaluation.style import COLUMN, Picture, finish, frames_la
 from sb3_dreamer_urlb.evaluation.tables import Table, with_error
 
 POINTS = 100
+#: tags of logs, in words
+IN_WORDS = {"eval/mean_reward": "return of evaluations", "rollout/ep_rew_mean": "return of training episodes"}
 
 
 def compare(
@@ -47,11 +49,15 @@ def compare(
                 axes.axvline(run.switch * run.action_repeat, color="#999999", ls=":", lw=0.8, zorder=1)
         last = max(points)
         table.lines.append([label, with_error(points[last], digits=1), frames_label(last), str(len(members))])
-    axes.set(xlabel="environment frames", ylabel=name)
+    what = IN_WORDS.get(name, name)
+    axes.set(xlabel="environment frames", ylabel=what)
     axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
     counts = ", ".join(f"{label}: {len(members)}" for label, members in groups.items())
+    switched = " Dotted: fine-tuning begins." if any(run.switch is not None for _, run in runs) else ""
+    one = " One seed has no band." if any(len(members) == 1 for members in groups.values()) else ""
     caption = (
-        f"{name} over environment frames; bands: mean ± standard error of the seeds ({counts}); dotted: fine-tuning begins."
+        f"{what[0].upper()}{what[1:]} ({name}) over environment frames; bands: mean ± standard error of the seeds "
+        f"({counts}).{one}{switched}"
     )
     return finish("comparison", figure, caption, False, handles, 2), table, _settings(groups)
 

@@ -15,7 +15,7 @@ from sb3_dreamer_urlb.evaluation.names import method
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scatter import scatter
 from sb3_dreamer_urlb.evaluation.snapshot_figures import longer_pretraining, snapshots_by_category, snapshots_by_method
-from sb3_dreamer_urlb.evaluation.style import COLORS, COLUMN, Picture, finish, frames_label, new_figure
+from sb3_dreamer_urlb.evaluation.style import COLORS, COLUMN, STYLES, Picture, finish, frames_label, new_figure
 
 
 def benchmark(study: Study) -> Picture | None:
@@ -93,8 +93,8 @@ def zero_shot(study: Study) -> Picture | None:
     if not any(arm.rows for arm in arms[1:]):
         return None
     caption = (
-        f"Planning alone with the pre-trained model, at once (zero-shot) and {after(study)}; beside it an actor that had "
-        f"{frames_label(study.finetune)} frames of the task and nothing before."
+        f"Planning alone with a model pre-trained for {frames_label(study.pretrain)} frames: at once (zero-shot), and "
+        f"{after(study, pretrain=False)}; beside it an actor that had as many frames of the task and nothing before."
     )
     return domain_bars(study, "zero_shot", arms, "Zero-shot against fine-tuned", caption, COLUMN * 1.3)
 
@@ -115,7 +115,7 @@ def profiles(study: Study, repetitions: int = REPETITIONS) -> Picture | None:
         share, low, high = performance_profile(arm.scores(study.normalizer), thresholds, repetitions)
         color = COLORS[i % len(COLORS)]
         # Where lines cross, colours alone are hard to follow.
-        style = ("-", "--", "-.", ":")[(i + i // len(COLORS)) % 4]
+        style = STYLES[(i + i // len(COLORS)) % len(STYLES)]
         axes.fill_between(100 * thresholds, 100 * low, 100 * high, color=color, alpha=0.15, lw=0)
         handles += axes.plot(100 * thresholds, 100 * share, color=color, ls=style, label=arm.label, drawstyle="steps-post")
     axes.set(

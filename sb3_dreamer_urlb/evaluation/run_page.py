@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -97,7 +98,7 @@ def _evaluation(row: Any) -> dict[str, str]:
         "task": task,
         "frames": f"{frames_label(row.pretrain_frames)} + {frames_label(row.finetune_frames)}",
         "planner": row.planner,
-        "return": f"{row.return_mean:.0f} ± {row.return_std:.0f}",
+        "return": f"{row.return_mean:.0f}" + ("" if math.isnan(row.return_std) else f" ± {row.return_std:.0f}"),
         "episodes": str(row.episodes),
         "score": f"{100 * normalized_score(task, row.return_mean):.1f} %" if known else "–",
         "oracle": f"{ORACLE[task]:.0f}" if known else "–",
@@ -143,7 +144,7 @@ def chart(series: Mapping[str, Series], title: str, switch: float | None = None,
     from matplotlib.figure import Figure
 
     with rc_context({**RC, "svg.fonttype": "none", "font.size": 10, "axes.titlesize": 10, "svg.hashsalt": title}):
-        figure = Figure(figsize=(4.6, 2.3), layout="constrained")
+        figure = Figure(figsize=(3.8, 2.1), layout="constrained")
         FigureCanvasSVG(figure)
         axes = figure.add_subplot()
         for i, (label, points) in enumerate(series.items()):
@@ -152,8 +153,11 @@ def chart(series: Mapping[str, Series], title: str, switch: float | None = None,
             axes.plot([repeat * step for step in x], y, color=COLORS[i % len(COLORS)], marker=marker, ms=3, label=label)
         if switch is not None:
             axes.axvline(repeat * switch, color="#D55E00", ls="--", lw=1)
-            axes.annotate("fine-tuning", (repeat * switch, 1), xycoords=("data", "axes fraction"), xytext=(3, -9),
-                          textcoords="offset points", color="#D55E00", fontsize=8)  # fmt: skip
+            low, high = axes.get_xlim()
+            late = repeat * switch > low + 0.65 * (high - low)
+            where, side = ((-3, -9), "right") if late else ((3, -9), "left")
+            axes.annotate("fine-tuning", (repeat * switch, 1), xycoords=("data", "axes fraction"), xytext=where,
+                          textcoords="offset points", ha=side, color="#D55E00", fontsize=8)  # fmt: skip
         axes.set(title=title, xlabel="environment frames")
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
         if len(series) > 1:

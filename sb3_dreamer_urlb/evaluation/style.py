@@ -17,6 +17,7 @@ from sb3_dreamer_urlb.version import how_to_install
 #: Okabe and Ito's colours, told apart by everybody, in the order of use
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999", "#B2A200", "#7F3C8D")
 HATCHES = ("", "//", "..", "xx", "\\\\", "++", "oo", "--", "**", "||")
+STYLES = ("-", "--", "-.", ":")
 MARKERS = "osD^vP*Xdh"
 #: inches, of one and of two columns of a conference paper
 COLUMN, PAGE = 3.35, 6.85
@@ -196,7 +197,8 @@ def lines(
         y, low, high = (scale * np.array([getattr(one, name) for one in found]) for name in ("value", "low", "high"))
         if band:
             axes.fill_between(x, low, high, color=style["color"], alpha=0.2, lw=0)
-            style["marker"] = "" if len(x) > 15 else style["marker"]
+            if len(x) > 15:
+                style |= {"marker": "", "linestyle": STYLES[i % len(STYLES)]}
         else:
             shift = (i - (len(series) - 1) / 2) * 0.03 * (x[-1] - x[0] if len(x) > 1 else 1) / max(1, len(series) / 3)
             x = x + shift

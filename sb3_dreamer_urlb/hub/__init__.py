@@ -6,6 +6,6 @@ needs nothing.
 """
 
 from sb3_dreamer_urlb.hub.package import load_from_hub, package_to_hub, push_to_hub
-from sb3_dreamer_urlb.hub.statistics import load_vec_normalize, save_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize, save_vec_normalize
 
 __all__ = ["load_from_hub", "load_vec_normalize", "package_to_hub", "push_to_hub", "save_vec_normalize"]

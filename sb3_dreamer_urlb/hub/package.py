@@ -24,9 +24,9 @@ from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository
-from sb3_dreamer_urlb.hub.statistics import save_vec_normalize
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.snapshots import bounded_json
+from sb3_dreamer_urlb.snapshots.vec_normalize import save_vec_normalize
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2

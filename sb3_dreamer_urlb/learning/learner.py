@@ -71,8 +71,8 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
             if any(parameter.requires_grad for parameter in agent.intrinsic.parameters()):
                 self.intrinsic_optimizer = self._optimizer(agent.intrinsic, config.learning_rate)
         self.task_reward_optimizer: ClippedAdam | None = None
-        if agent.task_reward is not None:
-            self.task_reward_optimizer = self._optimizer(agent.task_reward, config.learning_rate)
+        if (heads := agent.task_rewards or agent.task_reward) is not None:
+            self.task_reward_optimizer = self._optimizer(heads, config.learning_rate)
         statistics = [agent.reward_normalizer, *([] if agent.intrinsic is None else [agent.intrinsic])]
         self._get_ready(statistics, agent.intrinsic)
 
@@ -158,12 +158,23 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
 
     def _update_task_reward(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
         """What the task would pay, learnt beside the intrinsic reward; touches neither model nor exploration."""
-        head, optimizer = self.agent.task_reward, self.task_reward_optimizer
-        if head is None or optimizer is None:
+        optimizer = self.task_reward_optimizer
+        if optimizer is None:
             return {}
         with self._products():
-            loss = distributions.unit_normal_nll(head(posterior.feature), batch.reward).mean()
+            loss = th.stack([
+                distributions.unit_normal_nll(head(posterior.feature), reward).mean() for head, reward in self._tasks(batch)
+            ]).sum()  # fmt: skip
         return {"task_reward_grad_norm": optimizer.step(loss), "task_reward_loss": loss.detach()}
+
+    def _tasks(self, batch: SequenceBatch) -> Iterator[tuple[nn.Module, th.Tensor]]:
+        """Each head beside the model's own, and what it learns."""
+        if self.agent.task_rewards is None:
+            assert self.agent.task_reward is not None
+            yield self.agent.task_reward, batch.reward
+            return
+        assert batch.task_rewards is not None
+        yield from zip(self.agent.task_rewards.values(), batch.task_rewards.unbind(-1), strict=True)
 
     def _update_behavior(self, start: LatentState, is_terminal: th.Tensor) -> Metrics:
         agent, config = self.agent, self.config

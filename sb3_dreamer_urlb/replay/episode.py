@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,7 +15,8 @@ OBSERVATION = "observation"
 
 
 #: what rows hold
-COLUMNS = (OBSERVATION, "action", "reward", "is_terminal", "skill")
+TASK_REWARDS = "task_rewards"
+COLUMNS = (OBSERVATION, "action", "reward", "is_terminal", "skill", TASK_REWARDS)
 
 
 class NamedRows(ABC):
@@ -41,9 +43,10 @@ class Episode(NamedRows):
     :param observation: the episode's first observation; a Dict observation takes one column for each part
     :param action_size: A
     :param skill: under which the first action is chosen, (W,)
+    :param tasks: K, of how many tasks beside the environment's own the rewards are kept; no column without any
     """
 
-    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray):
+    def __init__(self, observation: RawObservation, action_size: int, skill: np.ndarray, tasks: int = 0):
         capacity = 128
         seen = observation_columns(observation)
         #: rows of each column, the first ``length`` of them filled
@@ -53,6 +56,7 @@ class Episode(NamedRows):
             "reward": np.zeros(capacity, np.float32),
             "is_terminal": np.zeros(capacity, bool),
             "skill": np.zeros((capacity, len(skill)), np.float32),
+            **({TASK_REWARDS: np.zeros((capacity, tasks), np.float32)} if tasks else {}),
         }
         self.length = 0
         self._put({**seen, "skill": skill})
@@ -71,13 +75,20 @@ class Episode(NamedRows):
         return self.length
 
     def append(
-        self, observation: RawObservation, action: np.ndarray, reward: float, is_terminal: bool, skill: np.ndarray
+        self,
+        observation: RawObservation,
+        action: np.ndarray,
+        reward: float,
+        is_terminal: bool,
+        skill: np.ndarray,
+        task_rewards: Sequence[float] = (),
     ) -> None:
-        """Add the row that ``action``, chosen under ``skill``, led to."""
+        """Add the row that ``action``, chosen under ``skill``, led to; what other tasks paid for it, (K,)."""
         if self.length == len(self.columns["reward"]):
             self._resize(2 * self.length)
         seen = observation_columns(observation)
-        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill})
+        paid = {TASK_REWARDS: task_rewards} if TASK_REWARDS in self.columns else {}
+        self._put({**seen, "action": action, "reward": reward, "is_terminal": is_terminal, "skill": skill, **paid})
 
     def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """Some rows of every column, by name; no copies."""

@@ -12,7 +12,7 @@ import math
 import os
 import warnings
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +22,11 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.envs.domain_rewards import KEY
 from sb3_dreamer_urlb.envs.env_steps import is_fault
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
-from sb3_dreamer_urlb.replay.episode import Episode, RawObservation, observation_columns, observation_of
+from sb3_dreamer_urlb.replay.episode import TASK_REWARDS, Episode, RawObservation, observation_columns, observation_of
 from sb3_dreamer_urlb.replay.prefetch import Prefetcher
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, Pieces, check_sampling, draw
 from sb3_dreamer_urlb.spaces.actions import make_actions
@@ -55,6 +56,7 @@ class SequenceReplayBuffer(ReplayBuffer):
     :param seed: of the sampler
     :param phase: name of the phase that filled it; a fine-tuning refuses a pre-training's buffer
     :param skill_size: W, size of the skills to store with each row, 0 for none
+    :param tasks: names of tasks whose rewards are stored with each row, from ``info["domain_rewards"]``
     :param store: ``"memory"``; ``"device"`` for the memory of ``device``, so that batches need not go there; ``"auto"`` for
         the latter on CUDA if ``buffer_size`` rows fit, else the former; or ``"lmdb"`` for a file that survives the process
         (``pip install '.[lmdb]'``). Open episodes are in memory in any case
@@ -83,6 +85,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         seed: int | None = None,
         phase: str = "",
         skill_size: int = 0,
+        tasks: Sequence[str] = (),
         store: str = stores.AUTO,
         path: str | os.PathLike[str] | None = None,
         map_size: int | None = None,
@@ -104,6 +107,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.sampling = sampling
         self.phase = phase
         self.skill_size = skill_size
+        self.tasks = tuple(tasks)
         self.rng = np.random.default_rng(seed)
         stores.check_store(store, path, map_size)
         self.disk: LmdbStore | None = None
@@ -231,11 +235,22 @@ class SequenceReplayBuffer(ReplayBuffer):
                 continue
             episode = self.open[i]
             if episode is None:
-                episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i])
+                episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i], len(self.tasks))
             terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
-            episode.append(self._row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i])
+            paid = self._paid(infos[i]) if self.tasks else ()
+            episode.append(self._row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i], paid)
             if done[i] or len(episode) >= self.max_episode_rows:
                 self._finish(i)
+
+    def _paid(self, info: dict[str, Any]) -> list[float]:
+        """What each of ``tasks`` paid for a step."""
+        rewards = info.get(KEY, {})
+        if missing := [task for task in self.tasks if task not in rewards]:
+            raise ValueError(
+                f"The environment does not tell the rewards of {', '.join(missing)}: make it with domain_rewards=True; "
+                f"info[{KEY!r}] has {sorted(rewards)}."
+            )
+        return [rewards[task] for task in self.tasks]
 
     def _row(self, observation: RawObservation, i: int) -> RawObservation:
         """The observation of environment ``i``, in the types that its space declares, whatever the environment gives."""
@@ -295,7 +310,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         """What a row of an episode consists of: name → type and shape, for files."""
         space = self.observation_space
         first = {name: _zeros(part) for name, part in space.items()} if isinstance(space, spaces.Dict) else _zeros(space)
-        episode = Episode(first, make_actions(self.action_space).size, np.zeros(self.skill_size, np.float32))
+        skill = np.zeros(self.skill_size, np.float32)
+        episode = Episode(first, make_actions(self.action_space).size, skill, len(self.tasks))
         return {name: (th.from_numpy(rows[:0]).dtype, rows.shape[1:]) for name, rows in episode.columns.items()}
 
     # -- reading -------------------------------------------------------------------------------------------------------
@@ -323,6 +339,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             columns[gathering.IS_FIRST],
             columns["is_terminal"],
             columns["skill"] if self.skill_size else None,
+            columns.get(TASK_REWARDS),
         )
 
     def _drawn(self, batch_size: int) -> gathering.Tensors:

@@ -33,6 +33,8 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     domain: str | None
     #: the set of hyperparameters that filled in what the caller left out
     preset: str
+    #: of ``KEPT``: whether the fine-tuning began with the pre-trained one; None where nobody knows
+    kept: dict[str, bool] | None
 
     @abstractmethod
     def _prepare(self) -> None:

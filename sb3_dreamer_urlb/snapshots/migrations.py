@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 #: of the files written now; goes up with every change that older code could not read
-VERSION = 3
+VERSION = 4
 
 
 def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
@@ -26,7 +26,12 @@ def _from_2(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2}
+def _from_3(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Version 4 says what a fine-tuning began with; of older ones nobody knows."""
+    return {**data, "kept": None} if kind == "model" else data
+
+
+MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2, 3: _from_3}
 
 
 def migrate(kind: str, data: dict[str, Any], version: int) -> dict[str, Any]:

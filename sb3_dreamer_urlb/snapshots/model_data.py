@@ -26,8 +26,10 @@ COUNTERS = (
 )  # fmt: skip
 FIELDS = {
     "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "counters",
-    "progress_remaining", "random", "episodes", "run",
+    "progress_remaining", "random", "episodes", "run", "kept",
 }  # fmt: skip
+#: what a fine-tuning may begin with, beside the world model
+KEPT = {"actor", "critic", "reward"}
 MAX_ENVS = 65_536
 #: whose statistics are kept
 MAX_EPISODES = 1000
@@ -76,6 +78,7 @@ def describe(model: SavedAlgorithm, run: dict[str, Any] | None) -> dict[str, Any
             if all(is_finite_number(info.get(key)) for key in ("r", "l", "t"))
         ],
         "run": run,
+        "kept": model.kept,
     }
 
 
@@ -197,6 +200,11 @@ def restore_fields(model: SavedAlgorithm, data: dict[str, Any]) -> None:
         raise ValueError(f"its phase is {str(data['phase'])[:80]!r}; known are {sorted(phases.PHASES)}")
     if not (data["domain"] is None or isinstance(data["domain"], str)):
         raise ValueError("its domain is no text")
+    kept = data["kept"]
+    known = isinstance(kept, dict) and set(kept) == KEPT and all(type(one) is bool for one in kept.values())
+    if not (kept is None or known):
+        raise ValueError(f"what its fine-tuning kept is {str(kept)[:80]}")
+    model.kept = kept
     if type(data["n_envs"]) is not int or not 1 <= data["n_envs"] <= MAX_ENVS:
         raise ValueError(f"its n_envs is {str(data['n_envs'])[:80]}")
     if not is_finite_number(data["progress_remaining"]):

@@ -19,7 +19,7 @@ import yaml
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
-from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
 
 #: rl_zoo3's name of the algorithm that these commands share
 ALGORITHM = "dreamerv2"

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import gymnasium
 import pytest
-from counter_task import ENV
+from counter_task import ENV, STATES
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, Plan, runs_of
 from sb3_dreamer_urlb.analysis.study import StudyFolder
 from sb3_dreamer_urlb.cli.study import NAMES
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 
 SMALL = {"seeds": 1, "methods": ("lbs",), "tasks": ("walker-run",), "pretrain": (40, 56), "finetune": 48}
 
@@ -94,6 +96,38 @@ def test_zero_shot_and_modules_share_nothing_but_the_folder(tmp_path):
     assert study.work(critic) == 1
     row = next(row for row in read_rows(study.rows).rows if row.keep_critic)
     assert (row.method, row.keep_actor, row.planner) == ("lbs", True, "none")
+
+
+def test_agents_without_pre_training_beside_a_study(tmp_path):
+    runs = runs_of("longer", Plan(**{**SMALL, "pretrain": (40,)}), scratch=True)
+    [tuned, scratch] = runs
+    assert (scratch.start.method, scratch.env, scratch.frames) == ("scratch", tuned.env, tuned.frames)
+    study = folder(tmp_path)
+    assert study.work(runs) == 2 and study.missing(runs) == []
+    rows = {row["run_folder"]: row for row in read_rows(study.rows).rows}
+    row = rows[scratch.name]
+    assert (row.method, row.pretrain_frames, row.finetune_frames, row.keep_actor) == ("dreamer", 0, 48, None)
+    assert (rows[tuned.name].keep_actor, rows[tuned.name].keep_critic) == (True, False)
+    assert sorted(path.name for path in (tmp_path / "snapshots").iterdir()) == [tuned.start.name]
+    fixed = runs_of("zero-shot", Plan(**{**SMALL, "tasks": ("jaco-reach_top_left",)}), scratch=True)
+    assert {run.env for run in fixed} == {"urlb/jaco-reach_top_left-fixed-v0"}
+
+
+def test_a_study_from_normalised_states(tmp_path):
+    """Fine-tuning goes on with the statistics of its snapshot, and evaluations see as the agent does."""
+
+    def states(name, count):
+        return VecNormalize(make_vec_env(STATES, count), norm_reward=False)
+
+    study = StudyFolder(tmp_path, {"preset": "tiny", "device": "cpu", "learning_starts": 12}, 1, states)
+    runs = runs_of("longer", Plan(**{**SMALL, "pretrain": (40,)}), scratch=True)
+    assert study.work(runs) == 2
+    begun = load_vec_normalize(beside(study.snapshot(runs[0].start, 40)), make_vec_env(STATES, 1)).obs_rms.count
+    ended = load_vec_normalize(beside(tmp_path / "tuned" / f"{runs[0].name}.zip"), make_vec_env(STATES, 1)).obs_rms.count
+    # 20 steps and their reset, then 24 steps and theirs.
+    assert ended - begun == pytest.approx(begun + 4, abs=6) and begun >= 20
+    [alone] = [run for run in runs if run.start.method == "scratch"]
+    assert beside(tmp_path / "tuned" / f"{alone.name}.zip").exists()
 
 
 def test_the_command_lists(tmp_path, capsys):

@@ -16,6 +16,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
+from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.agent_rows import env_columns, row_of
 from sb3_dreamer_urlb.evaluation.append import append_row
 from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
@@ -144,6 +145,26 @@ def test_a_row_says_who_played_where(tiny_model: Any, tmp_path: Any) -> None:
     assert row["arm"] == "mine" and "torch" in row["versions"] and len(row["returns"].split()) == 2
     append_row(tmp_path / "rows.csv", row)
     assert read_rows(tmp_path / "rows.csv").rows[0].key == row.key
+
+
+@pytest.mark.parametrize(("actor", "critic", "reward"), [(True, True, False), (False, False, True), (None, False, False)])
+def test_a_snapshot_remembers_what_its_fine_tuning_kept(
+    tiny_model: Any, tmp_path: Any, actor: bool | None, critic: bool, reward: bool
+) -> None:
+    model = tiny_model(CounterEnv(20, domain="walker", action_repeat=2), intrinsic_reward="lbs").learn(32)
+    model.fine_tune(keep_actor=actor, keep_critic=critic, keep_reward=reward)
+    model.save(tmp_path / "tuned.zip")
+    env = DummyVecEnv([lambda: CounterEnv(20, domain="walker", task="run")])
+    loaded = DreamerV2.load(tmp_path / "tuned.zip", env=env, device="cpu")
+    row = row_of(loaded, env, run_evaluation(loaded, env, 1))
+    # The paper keeps the walker's.
+    assert (row.keep_actor, row.keep_critic) == (actor is not False, critic)
+    assert row["known_reward"] == ("true" if reward else "")
+    given = row_of(loaded, env, run_evaluation(loaded, env, 1), keep_actor=False, keep_critic=False)
+    assert (given.keep_actor, given.keep_critic) == (False, False)
+    loaded.kept = None
+    unknown = row_of(loaded, env, run_evaluation(loaded, env, 1))
+    assert (unknown.keep_actor, unknown.keep_critic) == (None, None)
 
 
 def test_a_row_about_somebody_else_s_model() -> None:

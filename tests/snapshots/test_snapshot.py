@@ -585,6 +585,18 @@ def test_a_file_of_version_2_is_brought_up_to_date(saved, tmp_path):
     refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, old), "pretrained_frames")
 
 
+def test_a_file_of_version_3_is_brought_up_to_date(saved, tmp_path):
+    """It did not say what a fine-tuning began with."""
+    old = json.loads(members(saved[1])["data"])
+    kept = {"actor": True, "critic": False, "reward": True}
+    assert load(with_version(saved[1], tmp_path / "new.zip", VERSION, {**old, "kept": kept})).kept == kept
+    for wrong in ({"actor": True}, {**kept, "actor": 1}, [True], "yes"):
+        refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, {**old, "kept": wrong}), "fine-tuning kept")
+    del old["kept"]
+    loaded = load(with_version(saved[1], tmp_path / "old.zip", 3, old))
+    assert same(loaded, saved[0]) and loaded.kept is None
+
+
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])
 def test_versions_that_nobody_reads(saved, tmp_path, version):
     refused(with_version(saved[1], tmp_path / "m.zip", version), "version")

@@ -18,6 +18,16 @@ from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
 FIELDS = {*NUMBERS, "norm_obs", "norm_reward", "norm_obs_keys", "statistics"}
 MAX_BYTES = 8 << 20
+#: ending of the file of statistics that belongs to the snapshot of the same name
+BESIDE = ".vec_normalize.json"
+
+
+def beside(snapshot: Path) -> Path:
+    """Where the statistics of a snapshot lie.
+
+    :param snapshot: ``NAME.zip``
+    """
+    return snapshot.with_name(snapshot.name.removesuffix(".zip") + BESIDE)
 
 
 def save_vec_normalize(env: VecNormalize, path: str | os.PathLike[str]) -> None:
