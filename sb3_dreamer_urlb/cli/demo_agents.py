@@ -20,7 +20,7 @@ from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.episodes import OFF, ON, run_evaluation
 from sb3_dreamer_urlb.evaluation.recording import record
-from sb3_dreamer_urlb.hub.statistics import load_vec_normalize, save_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize, save_vec_normalize
 
 #: frames of a film, and its side in pixels
 FILM_STEPS, FILM_SIDE = 150, 192

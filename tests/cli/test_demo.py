@@ -15,7 +15,7 @@ from sb3_dreamer_urlb.cli.demo_pictures import curves, film
 from sb3_dreamer_urlb.cli.pace import Pace
 from sb3_dreamer_urlb.cli.side_by_side import PRETRAINED, SCRATCH, SHIPPED, DemoConfig, run_demo
 from sb3_dreamer_urlb.evaluation.rows import read_rows
-from sb3_dreamer_urlb.hub.statistics import load_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
 
 
 def test_everything_promised_is_written(tmp_path, capsys):
