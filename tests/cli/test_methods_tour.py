@@ -26,12 +26,12 @@ def cheap_walker(monkeypatch):
 
 def test_all_eight(cheap_walker, tmp_path, capsys):
     config = TourConfig(
-        tmp_path, EIGHT, pretrain_frames=240, finetune_frames=160, episodes=1, preset="tiny", jobs=1, log_every=8
+        tmp_path, EIGHT, pretrain_frames=120, finetune_frames=80, episodes=1, preset="tiny", jobs=1, log_every=4
     )
     visits = run_tour(config)
     assert [seen.method for seen in visits] == list(EIGHT)
     for seen in visits:
-        assert seen.updates > 0 and len(seen.returns) == 1 and (tmp_path / f"{seen.method}_240.zip").exists()
+        assert seen.updates > 0 and len(seen.returns) == 1 and (tmp_path / f"{seen.method}_120.zip").exists()
         assert (len(seen.reward) > 1) == (seen.method != "random")
         assert len(seen.loss) == (0 if seen.method in ("random", "apt") else 2)
     lines = capsys.readouterr().out.splitlines()
