@@ -144,8 +144,7 @@ def discrepancy(study: Study) -> Picture | None:
         return None
     caption = (
         "Latent dynamics discrepancy in nats (Jensen–Shannon, fine-tuned against pre-trained model) and the ratio of "
-        f"zero-shot to fine-tuned return {after(study)}, one point a run, {seeds([tuned])}. Line and band: linear fit and the "
-        "95 % interval of its mean."
+        f"zero-shot to fine-tuned return {after(study)}, one point a run, {seeds([tuned])}."
     )
     return scatter(
         "discrepancy", points, "latent dynamics discrepancy (nats)", "zero-shot / fine-tuned", caption, study.synthetic

@@ -29,14 +29,17 @@ def scatter(
         handles.append(axes.scatter(xs, ys, s=18, color=COLORS[i % 10], marker=MARKERS[i % 10], label=label, zorder=3))
     pooled = np.array([point for found in points.values() for point in found])
     r, p = correlation(pooled[:, 0], pooled[:, 1])
-    if len(pooled) > 2 and not math.isnan(r):
+    fitted = len(pooled) > 2 and not math.isnan(r)
+    if fitted:
         at = np.linspace(pooled[:, 0].min(), pooled[:, 0].max(), 50)
         middle, half = _fit(pooled[:, 0], pooled[:, 1], at)
         axes.plot(at, middle, color="#333333", lw=1.2)
         axes.fill_between(at, middle - half, middle + half, color="#333333", alpha=0.15, lw=0)
         axes.set_title(f"r = {_signed(r)}, p = {p:.2g}")
     axes.set(xlabel=x, ylabel=y)
-    text = f"{caption} Pearson's r = {_signed(r)}, p = {p:.2g}, {len(pooled)} points."
+    verdict = "too few for a correlation" if math.isnan(r) else f"Pearson's r = {_signed(r)}, p = {p:.2g}"
+    line = " Line and band: linear fit and the 95 % interval of its mean." if fitted else ""
+    text = f"{caption}{line} {len(pooled)} points: {verdict}."
     return finish(name, figure, text, synthetic, handles, 3)
 
 

@@ -162,8 +162,9 @@ def bars(
                 around = [[scale * (estimate.value - estimate.low)], [scale * (estimate.high - estimate.value)]]
                 axes.errorbar(x, scale * estimate.value, around, color="#333333", lw=0.9, capsize=1.5)
             if part:
-                axes.text(x, scale * estimate.value, f"{estimate.tasks} of {tasks} tasks ", rotation=90, ha="center", va="top",
-                          fontsize=6, color="black")  # fmt: skip
+                # At its foot, away from the error bar.
+                axes.text(x, 0.02, f"{estimate.tasks} of {tasks} tasks", transform=axes.get_xaxis_transform(), rotation=90,
+                          ha="center", va="bottom", fontsize=6, color="black")  # fmt: skip
     axes.set_xticks(range(len(groups)), groups)
     axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
