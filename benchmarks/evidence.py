@@ -4,11 +4,12 @@
     python benchmarks/evidence.py list                # what there is and what is missing
     python benchmarks/evidence_results.py             # what the finished ones say, with intervals and a figure
 
-An agent that sees states (``observation="state"``) pre-trains on walker stand without its reward, then learns another task;
-beside it agents that learn that task from scratch. Everything lies in ``results/evidence``: ``episodes.csv``, a row for every
-episode of every finished run; ``rows.csv``, a row for every score (actor alone, and with Dyna-MPC); ``snapshots/``, the
-pre-trained agents, from which further fine-tunings start. Runs that are under way keep themselves in ``runs/`` and go on there
-when they are asked for again; several processes, each with its own run, may work beside each other.
+An agent that sees states (``observation="state"``) explores a body without any reward, the walker or, for a sparse task, the
+finger; then it learns a task. Beside it stand agents that learn that task from scratch. Everything lies in
+``results/evidence``: ``episodes.csv``, a row for every episode of every finished run; ``rows.csv``, a row for every score
+(actor alone, and with Dyna-MPC); ``snapshots/``, the pre-trained agents, from which further fine-tunings start. Runs that are
+under way keep themselves in ``runs/`` and go on there when they are asked for again; several processes, each with its own run,
+may work beside each other.
 """
 
 from __future__ import annotations
@@ -38,7 +39,13 @@ from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.rows import Row
 
 ROOT = Path(__file__).parents[1] / "results" / "evidence"
-PRESET, PRIMAL = "state-small", "stand"
+PRESET = "state-small"
+#: body → the environment of its pre-training, whose reward nobody sees
+PRIMAL = {"walker": "stand", "finger": "spin"}
+#: task → body, where it is not the walker. Spin pays 1 while the finger spins fast, else 0: random actions get 2 of 1000
+BODIES = {"spin": "finger"}
+#: any task of dm_control's suite
+SUITE = "urlb/dm_control-v0"
 #: agent steps; an episode has 500
 PRETRAINING, FINETUNING, REPEAT = 20_000, 10_000, 2
 #: name of an arm → intrinsic reward of its pre-training (None: from scratch), and whether the actor is kept
@@ -51,9 +58,11 @@ ARMS: dict[str, tuple[str | None, bool]] = {
 }
 #: what to run, most telling first: arms, tasks, number of seeds
 STUDY: tuple[tuple[tuple[str, ...], tuple[str, ...], int], ...] = (
-    (("lbs-kept", "scratch"), ("run", "flip"), 10),
-    (("random-fresh", "lbs-fresh"), ("run", "flip"), 10),
-    (("plan2explore-kept",), ("run", "flip"), 10),
+    (("lbs-kept", "scratch"), ("run", "flip"), 5),
+    (("lbs-kept", "scratch"), ("spin",), 3),
+    (("random-fresh", "lbs-fresh"), ("run", "flip"), 3),
+    (("lbs-kept", "scratch"), ("run", "flip", "spin"), 10),
+    (("random-fresh", "lbs-fresh", "plan2explore-kept"), ("run", "flip", "spin"), 10),
 )
 #: of the evaluation at a run's end
 EPISODES, EVALUATION_SEED = 10, 10_000
@@ -62,25 +71,28 @@ EPISODES, EVALUATION_SEED = 10, 10_000
 @dataclass(frozen=True)
 class Run:
     """
-    :param arm: of ``ARMS``
-    :param task: of the walker; ``""`` for the pre-training itself
+    :param arm: of ``ARMS``, or the method of a pre-training
+    :param task: of the body; ``""`` for the pre-training itself
     :param seed: of everything
+    :param body: of ``PRIMAL``
     """
 
     arm: str
     task: str
     seed: int
+    body: str = "walker"
 
     @property
     def name(self) -> str:
         """Of its folder, and in ``episodes.csv``."""
-        return f"{self.task}/{self.arm}/{self.seed}" if self.task else f"pretraining/{self.arm}/{self.seed}"
+        body = "" if self.body == "walker" else f"-{self.body}"
+        return f"{self.task or f'pretraining{body}'}/{self.arm}/{self.seed}"
 
     @property
     def needs(self) -> Run | None:
         """The pre-training that it starts from."""
         method, _ = ARMS.get(self.arm, (None, False))
-        return Run(method, "", self.seed) if self.task and method is not None else None
+        return Run(method, "", self.seed, self.body) if self.task and method is not None else None
 
 
 def wanted() -> Iterator[Run]:
@@ -88,7 +100,7 @@ def wanted() -> Iterator[Run]:
     seen = set()
     for arms, tasks, seeds in STUDY:
         for seed, task, arm in itertools.product(range(seeds), tasks, arms):
-            run = Run(arm, task, seed)
+            run = Run(arm, task, seed, BODIES.get(task, "walker"))
             for one in (run.needs, run):
                 if one is not None and one not in seen:
                     seen.add(one)
@@ -99,8 +111,10 @@ def wanted() -> Iterator[Run]:
 
 
 def make_env(task: str, seed: int, statistics: Path | None = None, training: bool = True, n_envs: int = 1) -> VecNormalize:
-    """Walker states, normalised: with the statistics of the pre-training where there was one."""
-    env = DummyVecEnv([lambda: Monitor(gymnasium.make(f"urlb/walker-{task}-v0", observation="state"))] * n_envs)
+    """States of a task, normalised: with the statistics of the pre-training where there was one."""
+    body = BODIES.get(task, "walker")
+    name, which = (f"urlb/walker-{task}-v0", {}) if body == "walker" else (SUITE, {"domain": body, "task": task})
+    env = DummyVecEnv([lambda: Monitor(gymnasium.make(name, observation="state", **which))] * n_envs)
     env.seed(seed)
     normalized = VecNormalize(env, norm_reward=False, training=training)
     if statistics is not None:
@@ -139,7 +153,8 @@ class Episodes(BaseCallback):
 
 def snapshot_of(pretraining: Run) -> Path:
     """Where a pre-trained agent lies; its statistics beside it, ``.npz``."""
-    return ROOT / "snapshots" / f"{pretraining.arm}-{pretraining.seed}.zip"
+    body = "" if pretraining.body == "walker" else f"{pretraining.body}-"
+    return ROOT / "snapshots" / f"{body}{pretraining.arm}-{pretraining.seed}.zip"
 
 
 def begin(run: Run, folder: Path) -> tuple[DreamerV2, int]:
@@ -147,7 +162,7 @@ def begin(run: Run, folder: Path) -> tuple[DreamerV2, int]:
     method, keep_actor = (run.arm, False) if not run.task else ARMS[run.arm]
     source = None if run.needs is None else snapshot_of(run.needs)
     start = None if source is None else source.with_suffix(".npz")
-    env = make_env(run.task or PRIMAL, run.seed if not run.task else 1000 + run.seed, start)
+    env = make_env(run.task or PRIMAL[run.body], run.seed if not run.task else 1000 + run.seed, start)
     left = DreamerV2.resume(folder, env, device="cpu")
     if left is not None:
         return left, FINETUNING if run.task else PRETRAINING
@@ -209,7 +224,7 @@ def score(run: Run, model: DreamerV2, env: VecNormalize, folder: Path) -> None:
         rows.append(
             Row(
                 method=method or "dreamer",
-                domain="walker",
+                domain=run.body,
                 task=run.task,
                 seed=run.seed,
                 pretrain_frames=0 if method is None else PRETRAINING * REPEAT,
@@ -256,13 +271,18 @@ def curves() -> dict[str, list[tuple[int, float]]]:
     return found
 
 
-def work(minutes: float, at_most: int | None) -> None:
-    """Do missing runs until the time is up; one that is under way then is stopped and kept by a signal, or a kill."""
+def work(minutes: float, at_most: int | None, body: str | None = None) -> None:
+    """Do missing runs until the time is up; one that is under way then is stopped and kept by a signal, or a kill.
+
+    :param minutes: after which no run is begun
+    :param at_most: runs
+    :param body: whose, None for all
+    """
     end, count = time.monotonic() + 60 * minutes, 0
     for run in wanted():
         if time.monotonic() > end or count == at_most:
             return
-        if run.name in curves() or (run.needs is not None and run.needs.name not in curves()):
+        if body not in (None, run.body) or run.name in curves() or (run.needs is not None and run.needs.name not in curves()):
             continue
         with locked(run.name.replace("/", "-") + ".lock", wait=False) as mine:
             if mine and run.name not in curves():
@@ -277,11 +297,12 @@ def main() -> None:
     run = commands.add_parser("run", help="do missing runs")
     run.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
     run.add_argument("--at-most", type=int, help="runs")
+    run.add_argument("--body", choices=PRIMAL, help="whose (default: all)")
     commands.add_parser("list", help="all runs, and which are done")
     options: Any = parser.parse_args()
     th.set_num_threads(1)
     if options.command == "run":
-        work(options.minutes, options.at_most)
+        work(options.minutes, options.at_most, options.body)
     else:
         done = curves()
         for one in wanted():

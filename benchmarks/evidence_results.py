@@ -49,11 +49,11 @@ def scores() -> Scores:
 
     for name, episodes in evidence.curves().items():
         task, arm, _ = name.split("/")
-        if task != "pretraining":
+        if not task.startswith("pretraining"):
             returns = [value for _, value in sorted(episodes)]
             add(task, arm, "whole", float(np.mean(returns)))
             add(task, arm, "last quarter", float(np.mean(returns[-max(len(returns) // 4, 1) :])))
-    for row in read_rows(evidence.ROOT / "rows.csv").rows:
+    for row in read_rows(evidence.ROOT / "rows.csv", tasks=("finger-spin",)).rows:
         add(row.task, row.further["arm"], f"end, {'actor' if row.planner == 'none' else 'Dyna-MPC'}", row.return_mean)
     return found
 
@@ -116,7 +116,9 @@ def draw(path: Path) -> None:
             frames = evidence.REPEAT * 500 * np.arange(1, length + 1)
             axes.plot(frames, middle, color=COLORS[i], label=f"{label} ({len(runs)})")
             axes.fill_between(frames, low, high, color=COLORS[i], alpha=0.2, lw=0)
-        axes.set(title=f"walker {task}", xlabel="environment frames of the task", ylim=(0, None))
+        axes.set(
+            title=f"{evidence.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None)
+        )
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
         axes.legend(loc="upper left", title="agent (seeds)", title_fontsize=7)
     panels[0].set_ylabel("return of a training episode")
