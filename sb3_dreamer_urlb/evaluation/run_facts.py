@@ -63,15 +63,23 @@ class RunFacts:
 
     @property
     def switch(self) -> float | None:
-        """Agent steps at which fine-tuning began; None without both phases."""
+        """Agent steps at which fine-tuning began; None without both phases in this run."""
         frames = self.counters.get("pretrained_frames", 0)
         if frames:
-            return float(frames / self.action_repeat)
+            return None if self.begins_with_fine_tuning else float(frames / self.action_repeat)
         points = self.series.get("time/phase_frames", [])
         for (_, before), (step, after) in pairwise(points):
             if after < before:
                 return step - after / self.action_repeat
         return None
+
+    @property
+    def begins_with_fine_tuning(self) -> bool:
+        """Whether the pre-training was another run: the steps that this one counts are those of its fine-tuning."""
+        counters = self.counters
+        before = counters.get("num_timesteps", 0) * self.action_repeat - counters.get("phase_frames", 0)
+        pretrained = counters.get("pretrained_frames", 0)
+        return bool(pretrained and before < pretrained / 2)
 
     def warnings(self) -> list[str]:
         """What a reader should know before trusting the run."""
@@ -104,7 +112,8 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         if films:
             facts.films[kind] = films[-1]
     for path in [*sorted(folder.glob("*.csv")), *(rows or [])]:
-        if path.name == "progress.csv":
+        # Stable-Baselines3's: the log, and what Monitor keeps.
+        if path.name == "progress.csv" or path.name.endswith("monitor.csv"):
             continue
         try:
             read = read_rows(path, strict=False)

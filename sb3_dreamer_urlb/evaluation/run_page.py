@@ -109,6 +109,13 @@ def _evaluation(row: Any) -> dict[str, str]:
 def _call(facts: RunFacts) -> str:
     arguments = ", ".join(f"{name}={value!r}" for name, value in sorted(facts.arguments.items()) if value is not None)
     frames = facts.counters.get("pretrained_frames", 0)
+    if facts.begins_with_fine_tuning:
+        kept = ", ".join(f"keep_{name}={value}" for name, value in (facts.data.get("kept") or {}).items())
+        steps = facts.counters.get("num_timesteps", 0)
+        return (
+            f"model = DreamerV2.load(SNAPSHOT, env=env)  # of a pre-training of {frames} frames\n"
+            f"model.fine_tune({kept})\nmodel.learn({steps}, reset_num_timesteps=True)"
+        )
     switch = f", callback=PhaseSwitchCallback({frames})" if frames else ""
     steps = facts.counters.get("num_timesteps", 0)
     return f"model = DreamerV2({facts.data.get('policy')!r}, env, {arguments})\nmodel.learn({steps}{switch})"

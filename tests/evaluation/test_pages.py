@@ -101,6 +101,23 @@ def test_the_switch_of_phases_is_known(run: Path) -> None:
     assert facts.switch is not None
 
 
+def test_a_run_that_begins_with_a_snapshot_has_no_switch(tiny_model: Any, tmp_path: Path) -> None:
+    """The pre-training was another run; the file of Stable-Baselines3's Monitor is no file of evaluations."""
+    model = tiny_model(CounterEnv(20, **WALKER), intrinsic_reward="lbs").learn(40)
+    model.fine_tune(keep_actor=False)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(40, log_interval=1)
+    model.save(tmp_path / "finetuned.zip")
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 0.0, "env_id": "None"}\nr,l,t\n1.0,20,0.1\n')
+    facts = read_run(tmp_path)
+    assert (facts.counters["pretrained_frames"], facts.counters["num_timesteps"], facts.switch) == (80, 40, None)
+    assert facts.warnings() == []
+    assert main(["report", str(tmp_path)]) == 0
+    text = Page((tmp_path / "report.html").read_text()).text
+    assert "model.fine_tune(keep_actor=False, keep_critic=False, keep_reward=False)" in text
+    assert "a pre-training of 80 frames" in text and "PhaseSwitchCallback" not in text
+
+
 def test_warnings_stand_on_the_page(run: Path, tmp_path: Path) -> None:
     facts = read_run(run)
     facts.data["counters"] = {**facts.counters, "skipped_updates": 3, "env_faults": 2}
