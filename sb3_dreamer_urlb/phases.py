@@ -1,7 +1,4 @@
-"""The two phases of the benchmark: what distinguishes them, and which domains' actors are kept from one to the other.
-
-Paper §2 "Unsupervised RL" and §3 "Task-aware fine-tuning".
-"""
+"""The two phases of the benchmark: what distinguishes them (paper §2 "Unsupervised RL")."""
 
 from __future__ import annotations
 
@@ -34,17 +31,6 @@ PHASES: dict[str, Phase] = {
     FINETUNING: Phase(explores=False, random_warmup=False, plans=True, ent_coef=1e-4),
 }
 
-#: Domains whose tasks give reward only in small regions: the pre-trained actor would drive away from them (paper §3).
-SPARSE_DOMAINS = ("jaco",)
-
-
-def keeps_actor(domain: str | None) -> bool:
-    """The paper's task-aware rule: keep the actor where rewards are dense, drop it where they are sparse.
-
-    :param domain: of the fine-tuning task; None for an environment that does not tell, which counts as dense
-    """
-    return domain not in SPARSE_DOMAINS
-
 
 def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None, preset: float | None = None) -> float:
     """The actor's entropy bonus: the user's, else an exploring reward's own, else the preset's, else the phase's.
@@ -72,7 +58,8 @@ def __getattr__(name: str) -> Any:
     moved = {
         **dict.fromkeys(("PhaseSwitchCallback", "FineTuneCallback"), "callbacks.phase_switch"),
         **dict.fromkeys(("SnapshotCallback", "SNAPSHOT_FRAMES"), "callbacks.snapshot"),
-        **dict.fromkeys(("TRANSFER", "transfer"), "dreamer_v2.transfer"),
+        **dict.fromkeys(("TRANSFER", "transfer"), "dreamer_v2.kept_parts"),
+        **dict.fromkeys(("SPARSE_DOMAINS", "keeps_actor"), "transfer_rule"),
     }
     if name not in moved:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

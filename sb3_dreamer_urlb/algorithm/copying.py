@@ -1,4 +1,4 @@
-"""What moves from a pre-trained agent into a fine-tuning one: a table of its parts, and how it is followed."""
+"""Copying the parts of a pre-trained agent that a table keeps into a fine-tuning one."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Mapping
 
 from torch import nn
 
-KEPT, ACTOR_CHOICE, CRITIC_CHOICE, FRESH = "kept", "kept if keep_actor", "kept if keep_critic", "fresh"
+from sb3_dreamer_urlb.transfer_rule import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
 
 
-def transfer(source: nn.Module, target: nn.Module, table: Mapping[str, str], keep_actor: bool, keep_critic: bool) -> None:
+def copy_kept(source: nn.Module, target: nn.Module, table: Mapping[str, str], keep_actor: bool, keep_critic: bool) -> None:
     """Copy what a table keeps from one agent into a fresh one of the same sizes.
 
     :param source: pre-trained
     :param target: fresh; changed in place
-    :param table: from the name of a part to what becomes of it
+    :param table: from the name of a part to what becomes of it, see ``transfer_rule.py``
     :param keep_actor: whether ``ACTOR_CHOICE`` is kept
     :param keep_critic: whether ``CRITIC_CHOICE`` is kept
     """

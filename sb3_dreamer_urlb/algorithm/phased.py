@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb import phases, transfer_rule
 from sb3_dreamer_urlb.algorithm import checks, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
@@ -255,7 +255,7 @@ class PhasedAlgorithm(CollectingAlgorithm):
 
     def keeps_actor(self) -> bool:
         """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule."""
-        return phases.keeps_actor(self.domain)
+        return transfer_rule.keeps_actor(self.domain)
 
     def prepare_fine_tuning_env(self, env: GymEnv) -> VecEnv:
         """As :meth:`prepare_env`; also checks that the pre-trained model will be shown what it knows.

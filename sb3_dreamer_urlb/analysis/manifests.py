@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from sb3_dreamer_urlb.callbacks.snapshot import SNAPSHOT_FRAMES
 from sb3_dreamer_urlb.envs.registration import PRIMAL_TASK, URLB_TASKS, env_id
-from sb3_dreamer_urlb.phases import keeps_actor
+from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
 #: of the ablations (paper, §4): all that have an actor to keep
 METHODS = ("lbs", "icm", "plan2explore", "rnd", "apt", "diayn", "aps")

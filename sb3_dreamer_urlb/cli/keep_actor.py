@@ -33,10 +33,10 @@ def run(options: dict[str, Any]) -> int:
     """
     import numpy as np
 
-    from sb3_dreamer_urlb.analysis.task_aware import try_actor
+    from sb3_dreamer_urlb.analysis.actor_trial import try_actor
     from sb3_dreamer_urlb.cli.agents import load_agent
     from sb3_dreamer_urlb.number_checks import check_integer
-    from sb3_dreamer_urlb.phases import keeps_actor
+    from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
     check_integer("--episodes", options["episodes"], 1)
     model, env = load_agent(options, min(options["episodes"], 10))

@@ -17,7 +17,7 @@ from sb3_dreamer_urlb import native, phases
 from sb3_dreamer_urlb.agent import Agent
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
-from sb3_dreamer_urlb.dreamer_v2 import arguments, transfer
+from sb3_dreamer_urlb.dreamer_v2 import arguments, kept_parts
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
 from sb3_dreamer_urlb.dreamer_v2.presets import get_preset, with_preset
 from sb3_dreamer_urlb.envs.facts import env_fact
@@ -384,7 +384,7 @@ class DreamerV2(AgentAlgorithm):
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DreamerPolicy)
         known = _known_reward(pretrained.agent, self.env) if keep_reward else None
-        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic, known)
+        kept_parts.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic, known)
 
     def fix_skill(self, skill: int | np.ndarray | None) -> None:
         """Follow one skill from now on, in training as in ``predict`` (DIAYN, APS).
@@ -402,7 +402,7 @@ class DreamerV2(AgentAlgorithm):
         agent = self.policy.agent
         if not isinstance(agent.intrinsic, SkillReward) or agent.explores:
             return
-        sequences = -(-max(transfer.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
+        sequences = -(-max(kept_parts.SKILL_STATES, self.batch_size * self.batch_length) // self.batch_length)
         batch = self.replay_buffer.sample(sequences, env=self._drawn_through())
         model = agent.world_model
         with th.no_grad():

@@ -1,11 +1,11 @@
-"""What moves from a pre-trained DreamerV2 agent into a fine-tuning one (paper §3 "Task-aware fine-tuning")."""
+"""Which parts move from a pre-trained DreamerV2 agent into a fine-tuning one (paper §3 "Task-aware fine-tuning")."""
 
 from __future__ import annotations
 
 from sb3_dreamer_urlb.agent import Agent
-from sb3_dreamer_urlb.algorithm.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
-from sb3_dreamer_urlb.algorithm.transfer import transfer as transfer_parts
+from sb3_dreamer_urlb.algorithm.copying import copy_kept
 from sb3_dreamer_urlb.nn.nets import MLP
+from sb3_dreamer_urlb.transfer_rule import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
 
 #: What a fine-tuning takes over from the pre-trained agent (docs/algorithm.md, "Transfer"). Optimisers and replay always
 #: stay behind, and so does an intrinsic reward without skills: nothing in a fine-tuning agent would take it.
@@ -36,6 +36,6 @@ def transfer(source: Agent, target: Agent, keep_actor: bool, keep_critic: bool, 
     :param keep_critic: see ``TRANSFER``
     :param known_reward: begin with this reward head, the source's of the task
     """
-    transfer_parts(source, target, TRANSFER, keep_actor, keep_critic)
+    copy_kept(source, target, TRANSFER, keep_actor, keep_critic)
     if known_reward is not None:
         target.world_model.reward.load_state_dict(known_reward.state_dict())

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
-from sb3_dreamer_urlb.drq_v2 import arguments, transfer
+from sb3_dreamer_urlb.drq_v2 import arguments, kept_parts
 from sb3_dreamer_urlb.drq_v2.learner import DrQLearner, DrQLearnerConfig
 from sb3_dreamer_urlb.drq_v2.noise import NoiseStd, noise_at
 from sb3_dreamer_urlb.drq_v2.policies import CnnPolicy, DrQPolicy, MlpPolicy
@@ -214,7 +214,7 @@ class DrQv2(AgentAlgorithm):
 
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DrQPolicy)
-        transfer.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
+        kept_parts.transfer(pretrained.agent, self.policy.agent, keep_actor, keep_critic)
 
     def keeps_actor(self) -> bool:
         """Whether fine-tuning keeps the actor where nobody says: always, as the benchmark does for this agent."""

@@ -9,7 +9,7 @@ from sb3_dreamer_urlb.evaluation.aggregate import NEAR, Scores, final_rows, scor
 from sb3_dreamer_urlb.evaluation.names import METHODS, TASKS, method
 from sb3_dreamer_urlb.evaluation.rows import NONE, Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M
-from sb3_dreamer_urlb.phases import keeps_actor
+from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
 #: budgets of the benchmark, in environment frames (paper §2)
 FINETUNE, PRETRAIN = 100_000, 2_000_000

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 import torch as th
 
-from sb3_dreamer_urlb.replay.episode import Episode, NamedRows
+from sb3_dreamer_urlb.replay.episode import Episode
+from sb3_dreamer_urlb.replay.rows import NamedRows
 
 
 class DeviceEpisode(NamedRows):

@@ -21,7 +21,7 @@ from typing import IO, Any
 import lmdb
 import numpy as np
 
-from sb3_dreamer_urlb.replay.episode import NamedRows
+from sb3_dreamer_urlb.replay.rows import NamedRows
 
 #: rows that are read and written together
 CHUNK = 25

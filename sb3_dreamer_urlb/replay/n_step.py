@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.replay import gathering
-from sb3_dreamer_urlb.replay.episode import observation_of
+from sb3_dreamer_urlb.replay.rows import observation_of
 from sb3_dreamer_urlb.replay.sampling import BY_ROW, Pieces
 from sb3_dreamer_urlb.replay.sequence_buffer import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.windows import draw_windows

@@ -26,8 +26,9 @@ from sb3_dreamer_urlb.envs.domain_rewards import KEY
 from sb3_dreamer_urlb.envs.env_steps import is_fault
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
-from sb3_dreamer_urlb.replay.episode import TASK_REWARDS, Episode, RawObservation, observation_columns, observation_of
+from sb3_dreamer_urlb.replay.episode import Episode
 from sb3_dreamer_urlb.replay.prefetch import Prefetcher
+from sb3_dreamer_urlb.replay.rows import TASK_REWARDS, RawObservation, observation_columns, observation_of
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE, Pieces, check_sampling, draw
 from sb3_dreamer_urlb.spaces.actions import make_actions
 from sb3_dreamer_urlb.types import SequenceBatch

@@ -16,6 +16,7 @@ from sb3_dreamer_urlb.spaces.observations import Observations
 from sb3_dreamer_urlb.types import Imagination, LatentState, Metrics, ModelSizes, Observation, Posterior
 from sb3_dreamer_urlb.world_model.decoder import make_decoder
 from sb3_dreamer_urlb.world_model.encoder import make_encoder
+from sb3_dreamer_urlb.world_model.kl_balance import balanced_kl
 from sb3_dreamer_urlb.world_model.rssm import RSSM
 
 
@@ -94,7 +95,7 @@ class WorldModel(nn.Module):
         :param kl_scale: weight of the KL
         :return: loss (scalar) and metrics (detached scalars)
         """
-        kl_loss = self._kl_loss(posterior, free_nats, kl_balance)
+        kl_loss = balanced_kl(posterior.post_logits, posterior.prior_logits, free_nats, kl_balance)
         seen_losses = self.observations.losses(self.decoder(posterior.feature), observation)
         reward_feature = posterior.feature if reward_trains_model else posterior.feature.detach()
         reward_nll = distributions.unit_normal_nll(self.reward(reward_feature), reward).mean()
@@ -122,13 +123,6 @@ class WorldModel(nn.Module):
         with th.no_grad():
             kl = distributions.categorical_kl(post_logits, prior_logits)
         return Posterior(state, state.feature, embed, post_logits, prior_logits, kl)
-
-    @staticmethod
-    def _kl_loss(posterior: Posterior, free_nats: float, kl_balance: float) -> th.Tensor:
-        post, prior = posterior.post_logits, posterior.prior_logits
-        train_post = distributions.categorical_kl(post, prior.detach()).mean()
-        train_prior = distributions.categorical_kl(post.detach(), prior).mean()
-        return (1 - kl_balance) * train_post.clamp(min=free_nats) + kl_balance * train_prior.clamp(min=free_nats)
 
     # -- dreaming ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.__main__ import main
-from sb3_dreamer_urlb.analysis.task_aware import ActorTrial, try_actor
+from sb3_dreamer_urlb.analysis.actor_trial import ActorTrial, try_actor
 
 
 class PaysForTheFirstNumber(gymnasium.Wrapper):

@@ -12,8 +12,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
-from sb3_dreamer_urlb.dreamer_v2.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT, TRANSFER
-from sb3_dreamer_urlb.phases import keeps_actor
+from sb3_dreamer_urlb.dreamer_v2.kept_parts import TRANSFER
+from sb3_dreamer_urlb.transfer_rule import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT, keeps_actor
 
 
 def vec_env(n_envs=1, length=8, **attributes):

@@ -26,11 +26,11 @@ from sb3_dreamer_urlb import (
     SnapshotCallback,
     SnapshotError,
 )
-from sb3_dreamer_urlb.algorithm.transfer import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
+from sb3_dreamer_urlb.drq_v2.kept_parts import TRANSFER
 from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
-from sb3_dreamer_urlb.drq_v2.transfer import TRANSFER
 from sb3_dreamer_urlb.intrinsic import EncodedSteps, TransitionReward, register_intrinsic_reward
 from sb3_dreamer_urlb.intrinsic.registry import _REGISTRY
+from sb3_dreamer_urlb.transfer_rule import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT
 
 
 def vec_env(n_envs=1, length=8, **attributes):

@@ -10,7 +10,7 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.names import TASKS
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scores import ORACLE
-from sb3_dreamer_urlb.phases import keeps_actor
+from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
 SEEDS, PRETRAIN, FINETUNE = 3, 2_000_000, 100_000
 SHARE = {"lbs": 0.93, "plan2explore": 0.88, "icm": 0.85, "rnd": 0.84, "apt": 0.86, "diayn": 0.7, "aps": 0.72, "random": 0.6}
