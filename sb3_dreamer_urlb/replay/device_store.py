@@ -52,3 +52,25 @@ class DeviceEpisode(NamedRows):
     def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """The same on the host, copied unless it is the device."""
         return {name: part.cpu().numpy() for name, part in self.part(start, stop).items()}
+
+
+class OnItsWay:
+    """An open episode as batches on a device see it: what is asked for is copied there.
+
+    :param episode: in memory
+    :param device: where to
+    """
+
+    def __init__(self, episode: Episode, device: th.device):
+        self.episode, self.device = episode, device
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    def part(self, start: int, stop: int) -> dict[str, th.Tensor]:
+        """Some rows of every column, by name."""
+        return {name: th.from_numpy(part).to(self.device) for name, part in self.episode.rows(start, stop).items()}
+
+    def rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """The same on the host; no copies."""
+        return self.episode.rows(start, stop)

@@ -6,7 +6,7 @@ holds stacked observations, and each of them twice: six times the memory for sta
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_dreamer_urlb.replay import gathering
+from sb3_dreamer_urlb.replay import gathering, stores
+from sb3_dreamer_urlb.replay.device_store import OnItsWay
 from sb3_dreamer_urlb.replay.rows import observation_of
 from sb3_dreamer_urlb.replay.sampling import BY_ROW, Pieces
 from sb3_dreamer_urlb.replay.sequence_buffer import SequenceReplayBuffer
@@ -24,6 +25,9 @@ from sb3_dreamer_urlb.types import Observation, StepBatch, map_observation
 
 class NStepFrameReplayBuffer(SequenceReplayBuffer):
     """Draws steps of finished episodes uniformly, each with its stack of frames and its n-step return.
+
+    While none is finished, the open ones are drawn as they stand, so that learning begins when it is due however long an
+    episode takes. Endless ones are finished in pieces of ``max_episode_rows``.
 
     Stacks begin anew with each episode, whose first frame fills what is missing. A return ends with its episode: with fewer
     than n rewards, and with the value of the true last observation where the episode was truncated, without one where it
@@ -61,9 +65,9 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
         self.gamma = gamma
 
     def can_sample(self) -> bool:
-        """Whether an episode is finished."""
+        """Whether a step was made."""
         self.attach()
-        return len(self.episodes) > 0
+        return len(self._drawn_from()) > 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> StepBatch:  # type: ignore[override]
         """Draw steps uniformly.
@@ -71,15 +75,26 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
         :param batch_size: B
         :param env: normalises observations and rewards if given
         :return: on ``device``
-        :raises ValueError: if no episode is finished
+        :raises ValueError: if no step was made
         """
         if not self.can_sample():
-            raise ValueError("No episode is finished yet: there is nothing to draw.")
+            raise ValueError("No step was made yet: there is nothing to draw.")
         columns = self._drawn(batch_size) if env is None else self._drawn_and_normalized(batch_size, env)
         return steps_of(columns, self.frame_stack, self.n_steps, self.gamma)
 
     def _pieces(self, rng: np.random.Generator, batch_size: int) -> Iterator[Pieces]:
-        return draw_windows(rng, self.episodes, self.frame_stack - 1, self.n_steps, batch_size)
+        return draw_windows(rng, self._drawn_from(), self.frame_stack - 1, self.n_steps, batch_size)
+
+    def _drawn_from(self) -> Sequence[Any]:
+        if len(self.episodes) > 0:
+            episodes: Sequence[Any] = self.episodes
+            return episodes
+        begun = [episode for episode in self.open if episode is not None]
+        return [OnItsWay(episode, self.device) for episode in begun] if self.store == stores.DEVICE else begun
+
+    def _moment(self, batch_size: int) -> tuple[Any, ...]:
+        begun = () if len(self.episodes) > 0 else tuple(map(len, self._drawn_from()))
+        return *super()._moment(batch_size), begun
 
 
 def steps_of(columns: gathering.Tensors, frame_stack: int, n_steps: int, gamma: float) -> StepBatch:

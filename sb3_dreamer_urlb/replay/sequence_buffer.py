@@ -367,11 +367,16 @@ class SequenceReplayBuffer(ReplayBuffer):
     def _draws(self, rng: np.random.Generator, batch_size: int) -> list[gathering.Draw]:
         """Which rows make the sequences."""
         places = self._pieces(rng, batch_size)
-        return [[(self.episodes[index], start, stop) for index, start, stop in pieces] for pieces in places]
+        episodes = self._drawn_from()
+        return [[(episodes[index], start, stop) for index, start, stop in pieces] for pieces in places]
 
     def _pieces(self, rng: np.random.Generator, batch_size: int) -> Iterator[Pieces]:
         """Where they lie."""
-        return draw(self.sampling, rng, self.episodes, self.batch_length, batch_size)
+        return draw(self.sampling, rng, self._drawn_from(), self.batch_length, batch_size)
+
+    def _drawn_from(self) -> Any:
+        """The episodes that may be drawn, oldest first."""
+        return self.episodes
 
     def _tensor(self, array: np.ndarray) -> th.Tensor:
         return th.from_numpy(array).to(self.device, non_blocking=True)

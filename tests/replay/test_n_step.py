@@ -118,13 +118,14 @@ def test_frames_are_stored_once():
     assert buffer.episodes[0].rows(0, 10)["observation"].nbytes == 10 * 4
 
 
-def test_open_episodes_are_not_drawn():
+def test_open_episodes_are_not_drawn_beside_finished_ones():
     buffer = make()
-    obs = frame(0)[None]
-    buffer.add(obs, obs, np.zeros((1, 2), np.float32), np.zeros(1), np.array([False]), [{}])
     assert not buffer.can_sample()
-    with pytest.raises(ValueError, match="No episode is finished yet"):
+    with pytest.raises(ValueError, match="No step was made yet"):
         buffer.sample(2)
+    fill(buffer, [(3, False)])
+    buffer.add(frame(99)[None], frame(99)[None], np.zeros((1, 2), np.float32), np.zeros(1), np.array([False]), [{}])
+    assert buffer.sample(50).next_observation.max() < 99
 
 
 def test_dicts_and_vectors_are_stacked_too():
@@ -137,3 +138,27 @@ def test_dicts_and_vectors_are_stacked_too():
     batch = buffer.sample(4)
     assert batch.observation["image"].shape == (4, 3, 1, 2, 2)
     assert th.allclose(batch.observation["vector"][..., 0] * 10, batch.observation["image"][..., 0, 0, 0].float())
+
+
+@pytest.mark.parametrize("store", ["memory", "device"])
+@given(length=st.integers(1, 7))
+def test_while_no_episode_is_finished_the_open_one_is_drawn_as_if_it_ended_there(store, length):
+    open_, ended = make(store=store), make(store=store)
+    fill(ended, [(length, False)])
+    steps = list(live([(length, False)]))
+    for obs, next_obs, action, reward, _, _ in steps:
+        open_.add(obs[None], next_obs[None], action, np.array([reward]), np.array([False]), [{}])
+    assert not open_.episodes and len(ended.episodes) == 1
+    mine, its = (vars(buffer.sample(20)) for buffer in (open_, ended))
+    assert all(th.equal(mine[name], its[name]) for name in its)
+
+
+def test_what_was_fetched_ahead_is_dropped_when_an_open_episode_grew():
+    fetched, plain = make(prefetch=True), make()
+    for number, (obs, next_obs, action, reward, _, _) in enumerate(live([(9, False)])):
+        for buffer in (fetched, plain):
+            buffer.add(obs[None], next_obs[None], action, np.array([reward]), np.array([False]), [{}])
+        if number % 2:
+            assert th.equal(fetched.sample(6).observation, plain.sample(6).observation)
+            fetched.prefetch(6)
+    fetched.close()
