@@ -64,7 +64,7 @@ def is_positive(numbers):
     return all(0 < number < math.inf for number in numbers)
 
 
-@pytest.mark.parametrize("name", ["update", "planner", "replay", "snapshot", "curves"])
+@pytest.mark.parametrize("name", ["update", "planner", "planner_forms", "replay", "snapshot", "curves"])
 def test_ratios_come_first(run, name, tmp_path):
     picture = tmp_path / "curves.png"
     table, result = run(name, "--precision", "float32", *(["--picture", picture] if name == "curves" else []))

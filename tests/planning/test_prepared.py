@@ -58,14 +58,16 @@ def test_which_form_and_format(world_model):
 
 
 @pytest.mark.parametrize("bias", [None, th.randn(3)], ids=["no bias", "bias"])
-def test_prepacked_with_and_without_the_operators(monkeypatch, bias):
-    weight, x = th.randn(3, 7), th.randn(5, 7)
+def test_prepacked_is_a_linear_layer_in_each_format(bias):
+    weight, x, plus = th.randn(3, 7), th.randn(5, 7), th.randn(5, 3)
     expected = th.nn.functional.linear(x, weight, bias)
-    packed = prepacked.PrepackedLinear(weight, bias, th.float32)
-    monkeypatch.setattr(th.backends.mkldnn, "is_available", lambda: False)
-    plain = prepacked.PrepackedLinear(weight, bias, th.float32)
-    assert plain.packed is None
-    assert th.allclose(packed(x), expected, atol=1e-6) and th.equal(plain(x), expected)
+    layer = prepacked.PrepackedLinear(weight, bias, th.float32)
+    assert layer.packed is None
+    assert th.equal(layer(x), expected) and th.allclose(layer(x, plus), expected + plus)
+    short = prepacked.PrepackedLinear(weight, bias, th.bfloat16)
+    assert (short.packed is not None) == prepacked.cpu_multiplies_short()
+    assert th.allclose(short(x.bfloat16()).float(), expected, atol=0.1)
+    assert th.allclose(short(x.bfloat16(), plus.bfloat16()).float(), expected + plus, atol=0.1)
 
 
 # -- draws with the first dimension innermost ------------------------------------------------------------------------------

@@ -10,10 +10,10 @@ from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 
 
 class PrepackedLinear:
-    """x · weightᵀ + bias. oneDNN orders weights its own way before each product; here it does so once.
+    """x · weightᵀ + bias. oneDNN orders weights its own way before each bfloat16 product; here it does so once.
 
-    The two operators are those that torch.compile emits on CPUs; where torch lacks them this is an ordinary product. Where the
-    processor cannot multiply bfloat16 numbers, they are multiplied as float32 ones, and the result is rounded.
+    The two operators are those that torch.compile emits on CPUs. Where torch lacks them, or the processor cannot multiply
+    bfloat16 numbers, they are multiplied as float32 ones, and the result is rounded.
 
     :param weight: float (outputs, inputs)
     :param bias: float (outputs,), None for none
@@ -26,8 +26,9 @@ class PrepackedLinear:
         self.inner = th.float32 if dtype == th.bfloat16 and not cpu_multiplies_short() else dtype
         self.weight = weight.detach().to(dtype).to(self.inner)
         self.bias = None if bias is None else bias.detach().to(dtype).to(self.inner)
+        #: None for float32, whose products gain nothing from it (docs/notes/performance.md, "Forms of the planned agent")
         self.packed: th.Tensor | None = None
-        if th.backends.mkldnn.is_available() and hasattr(th.ops.mkldnn, "_reorder_linear_weight"):
+        if self.inner == th.bfloat16:
             self.packed = th.ops.mkldnn._reorder_linear_weight(self.weight.contiguous(), None)
 
     def __call__(self, x: th.Tensor, plus: th.Tensor | None = None, elu: bool = False) -> th.Tensor:
