@@ -1,4 +1,4 @@
-"""What a fine-tuning takes over from a pre-trained agent: the rule that decides on the actor, and what a table of parts may say.
+"""What a fine-tuning takes over: the rule that decides on the actor, and what a table of an agent's parts may say.
 
 Paper §3 "Task-aware fine-tuning". Each algorithm has its table in ``kept_parts.py``.
 """

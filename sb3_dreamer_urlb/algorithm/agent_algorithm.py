@@ -12,6 +12,7 @@ from stable_baselines3.common.noise import ActionNoise
 
 from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
+from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
 from sb3_dreamer_urlb.types import MetricMeans
@@ -20,11 +21,14 @@ from sb3_dreamer_urlb.types import MetricMeans
 class AgentAlgorithm(PhasedAlgorithm):
     """The part of an algorithm between its agent, its environments and its learner.
 
-    A subclass says with :meth:`_new_learner` what trains the agent and with :meth:`_learning_rates` how fast; it may override
-    :meth:`_prepare_policy` and :meth:`_prepare_updates`.
+    A subclass says with :meth:`_check_arguments` what fits, with :meth:`_new_learner` what trains the agent, with
+    :meth:`_learner_config` by which numbers and with :meth:`_learning_rates` how fast; it may override
+    :meth:`_prepare_policy`, :meth:`_prepare_updates` and :meth:`_tell_parts`.
     """
 
     policy: AgentPolicy[Any]
+    #: how updates run, one of ``graphs.COMPILE``
+    compile: str
     learner: BaseLearner[Any, Any]
     #: what the agents in the environments remember; None at their very beginning
     _acting_state: Memory | None = None
@@ -52,6 +56,31 @@ class AgentAlgorithm(PhasedAlgorithm):
         """What a user wants to know of what was built."""
         yield f"Products of updates in {self.learner.dtype}"
         yield f"Replay in the store {self.replay_buffer.store!r}"
+
+    @abstractmethod
+    def _check_arguments(self) -> None:
+        """
+        :raises ValueError: for a value that does not fit
+        """
+
+    @abstractmethod
+    def _learner_config(self) -> Any:
+        """The numbers of an update, as the arguments have them now."""
+
+    def _prepare(self) -> None:
+        self._check_arguments()
+        super()._prepare()
+        graphs.warn_if_in_vain(self.compile, self.device)
+
+    def _tell_parts(self) -> None:
+        """Policy and replay, as far as they hold copies of arguments that can be assigned."""
+
+    def _put_in_force(self) -> None:
+        self._check_arguments()
+        self._tell_parts()
+        self._setup_lr_schedule()
+        self._convert_train_freq()
+        self.learner.configure(self._learner_config())
 
     # -- files ---------------------------------------------------------------------------------------------------------
 

@@ -13,9 +13,14 @@ from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
 from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 
+#: arguments of every replay that the algorithm fills in itself
+REPLAY_ARGUMENTS_OF_THE_MODEL = {
+    "buffer_size", "observation_space", "action_space", "device", "n_envs", "batch_length", "phase", "skill_size", "tasks",
+}  # fmt: skip
 #: range of a number: (low, low allowed, high, high allowed)
 Range = tuple[float, bool, float, bool]
 
@@ -124,16 +129,56 @@ def check_method(intrinsic_reward: Any, phase: str) -> None:
         )
 
 
-def check_policy_kwargs(model: SavedAlgorithm, filled_in: set[str]) -> None:
+def check_kept(keep_actor: Any, keep_critic: Any, keep_reward: Any) -> None:
+    """What a fine-tuning is told to take over.
+
+    :param keep_actor: None lets the task decide
+    :param keep_critic: see ``fine_tune``
+    :param keep_reward: see ``fine_tune``
+    :raises ValueError: for anything but True and False
     """
+    if keep_actor is not None and not isinstance(keep_actor, bool):
+        raise ValueError(f"keep_actor must be True, False or None, got {keep_actor!r}.")
+    check_switch("keep_critic", keep_critic)
+    check_switch("keep_reward", keep_reward)
+
+
+def check_policy(model: SavedAlgorithm, base: type, filled_in: set[str]) -> None:
+    """The policy's class and its arguments.
+
     :param model: with its arguments, nothing built
+    :param base: class of the policies that the algorithm can train
     :param filled_in: arguments of the policy that the algorithm fills in itself
-    :raises ValueError: for arguments that the policy has not
+    :raises ValueError: for another class, or arguments that the policy has not
     """
-    known = set(named_parameters(model.policy_class)) - filled_in
-    unknown = sorted(set(model.policy_kwargs) - known)
+    kind: Any = model.policy_class
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise ValueError(
+            f"policy must be one of {sorted(model.policy_aliases)} or a subclass of {base.__name__}, got {kind!r}."
+        )
+    _check_names("policy_kwargs", model.policy_kwargs, kind, filled_in)
+
+
+def check_replay(model: SavedAlgorithm, base: type[SequenceReplayBuffer], filled_in: set[str], reason: str) -> None:
+    """The replay's class and its arguments.
+
+    :param model: with its arguments, nothing built
+    :param base: class of the replay that the algorithm draws from
+    :param filled_in: arguments of the replay that the algorithm fills in itself, beside those of every replay
+    :param reason: why no other replay will do
+    :raises ValueError: for another class, or arguments that the replay has not
+    """
+    kind = base if model.replay_buffer_class is None else model.replay_buffer_class
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise ValueError(f"replay_buffer_class must be a subclass of {base.__name__}, got {kind!r}: {reason}.")
+    _check_names("replay_buffer_kwargs", model.replay_buffer_kwargs, kind, REPLAY_ARGUMENTS_OF_THE_MODEL | filled_in)
+
+
+def _check_names(name: str, given: dict[str, Any], kind: type, filled_in: set[str]) -> None:
+    known = set(named_parameters(kind)) - filled_in
+    unknown = sorted(set(given) - known)
     if unknown:
-        raise ValueError(f"Unknown policy_kwargs {unknown}; known are {sorted(known)}.")
+        raise ValueError(f"Unknown {name} {unknown}; known are {sorted(known)}.")
 
 
 def check_env(model: SavedAlgorithm, env: VecEnv) -> None:

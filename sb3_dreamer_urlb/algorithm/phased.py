@@ -226,8 +226,10 @@ class PhasedAlgorithm(CollectingAlgorithm):
         :param keep_reward: begin with the task's reward head as the pre-training's rewards taught it (paper, appendix
             "Learning Rewards Online"): of this environment's task, if the pre-training learnt several by name
             (``learn_task_reward``), else that of the *pre-training* environment's task
-        :raises ValueError: if the model is not pre-training, or there is no such head
+        :raises ValueError: if the model is not pre-training, there is no such head, or one of these is neither true nor false
         """
+        keep_actor, keep_critic, keep_reward = plain((keep_actor, keep_critic, keep_reward))
+        checks.check_kept(keep_actor, keep_critic, keep_reward)
         if self.phase != phases.PRETRAINING:
             raise ValueError(
                 f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}: "

@@ -8,7 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
-from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.algorithm.checks import check_kept
+from sb3_dreamer_urlb.number_checks import is_integer, plain
 from sb3_dreamer_urlb.phases import PRETRAINING
 
 
@@ -25,8 +26,8 @@ class PhaseSwitchCallback(BaseCallback):
     :param keep_critic: for ablations
     :param keep_reward: begin with the task's reward head of the pre-training, see ``fine_tune``
     :param verbose: 1 prints the switch
-    :raises ValueError: for a number of frames that is not positive, and, when ``learn`` begins, for an ``env`` that does
-        not fit the model
+    :raises ValueError: for a number of frames that is not positive, or a choice that is neither true nor false; and, when
+        ``learn`` begins, for an ``env`` that does not fit the model
     """
 
     def __init__(
@@ -43,9 +44,8 @@ class PhaseSwitchCallback(BaseCallback):
             raise ValueError(f"pretrain_frames must be a positive integer, got {pretrain_frames!r}.")
         self.pretrain_frames = pretrain_frames
         self.env = env
-        self.keep_actor = keep_actor
-        self.keep_critic = keep_critic
-        self.keep_reward = keep_reward
+        self.keep_actor, self.keep_critic, self.keep_reward = kept = plain((keep_actor, keep_critic, keep_reward))
+        check_kept(*kept)
         #: close the environments that nobody needs any more, where nobody else holds them
         self.closes_pretraining = False
 
@@ -103,14 +103,14 @@ class FineTuneCallback(BaseCallback):
     :param keep_critic: for ablations
     :param keep_reward: begin with the task's reward head of the pre-training, see ``fine_tune``
     :param verbose: 1 prints what is fine-tuned
-    :raises ValueError: when ``learn`` begins, for a model that was not pre-trained
+    :raises ValueError: for a choice that is neither true nor false; and, when ``learn`` begins, for a model that was not
+        pre-trained
     """
 
     def __init__(self, keep_actor: bool | None = None, keep_critic: bool = False, verbose: int = 1, keep_reward: bool = False):
         super().__init__(verbose)
-        self.keep_actor = keep_actor
-        self.keep_critic = keep_critic
-        self.keep_reward = keep_reward
+        self.keep_actor, self.keep_critic, self.keep_reward = kept = plain((keep_actor, keep_critic, keep_reward))
+        check_kept(*kept)
 
     def _on_step(self) -> bool:
         return True
@@ -120,7 +120,7 @@ class FineTuneCallback(BaseCallback):
         if model.phase_timesteps == 0 and (model.phase == PRETRAINING or model.intrinsic_reward is None):
             raise ValueError(
                 "FineTuneCallback needs a pre-trained model, this one has seen 0 frames: "
-                "load a snapshot with DreamerV2.load, or with rl_zoo3's -i."
+                f"load a snapshot with {type(model).__name__}.load, or with rl_zoo3's -i."
             )
         if model.phase != PRETRAINING:
             return

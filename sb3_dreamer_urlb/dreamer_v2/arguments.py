@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFORCE
+from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number
@@ -100,7 +101,13 @@ def check(model: SavedAlgorithm) -> None:
     _check_tasks(given.learn_task_reward)
     checks.check_noise(model)
     _check_names(given, model.phase)
-    checks.check_policy_kwargs(model, POLICY_ARGUMENTS_OF_THE_MODEL)
+    checks.check_policy(model, DreamerPolicy, POLICY_ARGUMENTS_OF_THE_MODEL)
+    checks.check_replay(
+        model,
+        SequenceReplayBuffer,
+        set(),
+        "a world model learns from sequences, so SB3's transition buffers and HER do not apply",
+    )
     _check_spaces(given, model)
     if model.env is not None:
         check_episodes_fit(given.batch_length, model.replay_buffer_kwargs, model.env)
@@ -142,12 +149,6 @@ def _check_names(given: SimpleNamespace, phase: str) -> None:
         if getattr(given, name) and method is None:
             raise ValueError(f"{name}={getattr(given, name)!r} needs a pre-training, got intrinsic_reward=None.")
     make_planner(given.planner, given.planner_kwargs, given.gae_lambda, classes=None)
-    buffer_class = given.replay_buffer_class
-    if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, SequenceReplayBuffer)):
-        raise ValueError(
-            f"replay_buffer_class must be a subclass of SequenceReplayBuffer, got {buffer_class!r}: "
-            "a world model learns from sequences, so SB3's transition buffers and HER do not apply."
-        )
 
 
 def _check_spaces(given: SimpleNamespace, model: SavedAlgorithm) -> None:

@@ -22,7 +22,6 @@ from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, Dreamer
 from sb3_dreamer_urlb.dreamer_v2.presets import get_preset, with_preset
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
-from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.planning import Planner, make_planner
@@ -233,22 +232,16 @@ class DreamerV2(AgentAlgorithm):
 
     # -- set-up --------------------------------------------------------------------------------------------------------
 
-    def _prepare(self) -> None:
+    def _check_arguments(self) -> None:
         arguments.check(self)
-        super()._prepare()
-        self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
-        self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
-        graphs.warn_if_in_vain(self.compile, self.device)
 
-    def _put_in_force(self) -> None:
-        arguments.check(self)
-        planner = self._new_planner()
-        self._setup_lr_schedule()
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
         self._actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
         self._critic_lr_schedule = FloatSchedule(self.critic_learning_rate)
-        self._convert_train_freq()
-        self.policy.set_numbers(self.gamma, planner)
-        self.learner.configure(self._learner_config(self.policy.agent.intrinsic))
+
+    def _tell_parts(self) -> None:
+        self.policy.set_numbers(self.gamma, self._new_planner())
 
     def _read_env(self) -> None:
         super()._read_env()
@@ -270,7 +263,7 @@ class DreamerV2(AgentAlgorithm):
         yield f"Replay in the store {self.replay_buffer.store!r}"
 
     def _new_learner(self) -> Learner:
-        return Learner(self.policy.agent, self._learner_config(self._intrinsic()))
+        return Learner(self.policy.agent, self._learner_config())
 
     def _new_policy(self) -> DreamerPolicy:
         return self.policy_class(
@@ -298,7 +291,7 @@ class DreamerV2(AgentAlgorithm):
             return None
         return intrinsic
 
-    def _learner_config(self, intrinsic: IntrinsicReward | None) -> LearnerConfig:
+    def _learner_config(self) -> LearnerConfig:
         explores = phases.PHASES[self.phase].explores
         return LearnerConfig(
             learning_rate=self.lr_schedule(1),
@@ -314,7 +307,9 @@ class DreamerV2(AgentAlgorithm):
             imagination_horizon=self.imagination_horizon,
             gae_lambda=self.gae_lambda,
             target_update_interval=self.target_update_interval,
-            ent_coef=phases.phase_ent_coef(self.phase, intrinsic, self.ent_coef, get_preset(self.preset).get("ent_coef")),
+            ent_coef=phases.phase_ent_coef(
+                self.phase, self.policy.intrinsic, self.ent_coef, get_preset(self.preset).get("ent_coef")
+            ),
             reward_trains_model=self.reward_trains_model and not explores,
             trains_behavior=explores or self.policy.planner is None or self.policy.planner.config.use_value,
             precision=self.precision,

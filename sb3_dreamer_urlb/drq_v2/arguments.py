@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.drq_v2.noise import check_noise_std
+from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
@@ -26,6 +27,16 @@ NUMBERS: dict[str, checks.Range] = {
 POLICY_ARGUMENTS_OF_THE_MODEL = {
     "self", "observation_space", "action_space", "lr_schedule", "frame_stack", "noise_std", "intrinsic",
 }  # fmt: skip
+
+#: arguments of the replay that it fills in, too
+REPLAY_ARGUMENTS_OF_THE_MODEL = {"frame_stack", "n_steps", "gamma", "sampling"}
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.PhasedAlgorithm.assignable`
+ASSIGNABLE = frozenset(
+    {
+        "learning_rate", "adam_eps", "batch_size", "tau", "gamma", "noise_std", "noise_clip",
+        "learning_starts", "train_freq", "gradient_steps", "action_noise", "overlap", "verbose", "tensorboard_log",
+    }
+)  # fmt: skip
 
 
 def check(model: SavedAlgorithm) -> None:
@@ -51,13 +62,13 @@ def check(model: SavedAlgorithm) -> None:
     checks.check_forms(given.precision, given.compile)
     make_intrinsic_reward(given.intrinsic_reward, given.intrinsic_kwargs, TransitionReward)
     checks.check_method(given.intrinsic_reward, model.phase)
-    buffer_class = given.replay_buffer_class
-    if buffer_class is not None and not (isinstance(buffer_class, type) and issubclass(buffer_class, NStepFrameReplayBuffer)):
-        raise ValueError(
-            f"replay_buffer_class must be a subclass of NStepFrameReplayBuffer, got {buffer_class!r}: it stacks frames "
-            "and sums n-step returns when it is sampled."
-        )
-    checks.check_policy_kwargs(model, POLICY_ARGUMENTS_OF_THE_MODEL)
+    checks.check_policy(model, DrQPolicy, POLICY_ARGUMENTS_OF_THE_MODEL)
+    checks.check_replay(
+        model,
+        NStepFrameReplayBuffer,
+        REPLAY_ARGUMENTS_OF_THE_MODEL,
+        "it stacks frames and sums n-step returns when it is sampled",
+    )
     if getattr(model, "observation_space", None) is None:
         raise ValueError("DrQv2 needs an environment: env is None.")
     kind: Any = model.policy_class

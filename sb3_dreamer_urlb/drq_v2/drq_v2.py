@@ -17,7 +17,6 @@ from sb3_dreamer_urlb.drq_v2.noise import NoiseStd, noise_at
 from sb3_dreamer_urlb.drq_v2.policies import CnnPolicy, DrQPolicy, MlpPolicy
 from sb3_dreamer_urlb.drq_v2.presets import with_preset
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
-from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
 
 SelfDrQv2 = TypeVar("SelfDrQv2", bound="DrQv2")
@@ -81,8 +80,10 @@ class DrQv2(AgentAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy}
     policy_class: type[DrQPolicy]
+    assignable = arguments.ASSIGNABLE
     policy: DrQPolicy
     learner: DrQLearner
+    replay_buffer: NStepFrameReplayBuffer
     intrinsic_reward: str | type[TransitionReward] | TransitionReward | None
 
     @with_preset
@@ -160,15 +161,19 @@ class DrQv2(AgentAlgorithm):
 
     # -- set-up --------------------------------------------------------------------------------------------------------
 
-    def _prepare(self) -> None:
+    def _check_arguments(self) -> None:
         arguments.check(self)
-        super()._prepare()
-        graphs.warn_if_in_vain(self.compile, self.device)
+
+    def _tell_parts(self) -> None:
+        self.replay_buffer.gamma = self.gamma
 
     def _intrinsic(self) -> TransitionReward | None:
         """What the current phase explores with."""
-        explores = phases.PHASES[self.phase].explores
-        return make_intrinsic_reward(self.intrinsic_reward, self.intrinsic_kwargs, TransitionReward) if explores else None
+        if not phases.PHASES[self.phase].explores:
+            return None
+        kind: Any = TransitionReward
+        method: TransitionReward | None = make_intrinsic_reward(self.intrinsic_reward, self.intrinsic_kwargs, kind)
+        return method
 
     def _new_policy(self) -> DrQPolicy:
         return self.policy_class(
@@ -182,17 +187,18 @@ class DrQv2(AgentAlgorithm):
         )
 
     def _new_learner(self) -> DrQLearner:
-        config = DrQLearnerConfig(
+        return DrQLearner(self.policy.agent, self._learner_config())
+
+    def _learner_config(self) -> DrQLearnerConfig:
+        return DrQLearnerConfig(
             learning_rate=self.lr_schedule(1),
             adam_eps=self.adam_eps,
-            max_grad_norm=float("inf"),
             tau=self.tau,
             noise_clip=self.noise_clip,
             freeze_encoder=self.freeze_encoder and not phases.PHASES[self.phase].explores,
             precision=self.precision,
             compile=self.compile,
         )
-        return DrQLearner(self.policy.agent, config)
 
     def _new_replay_buffer(self) -> NStepFrameReplayBuffer:
         buffer_class: Any = self.replay_buffer_class or NStepFrameReplayBuffer

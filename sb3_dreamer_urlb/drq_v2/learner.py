@@ -6,6 +6,7 @@ Laskin et al., 2021).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -26,10 +27,11 @@ class DrQLearnerConfig:
 
     learning_rate: float
     adam_eps: float
-    max_grad_norm: float
     tau: float
     noise_clip: float
     freeze_encoder: bool
+    max_grad_norm: float = math.inf
+    weight_decay: float = 0.0
     precision: str = "float32"
     compile: str = "eager"
 
@@ -65,7 +67,7 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
 
     def _optimizer(self, parameters: Iterable[nn.Parameter]) -> ClippedAdam:
         config = self.config
-        return ClippedAdam(parameters, config.learning_rate, config.adam_eps, config.max_grad_norm, weight_decay=0.0)
+        return ClippedAdam(parameters, config.learning_rate, config.adam_eps, config.max_grad_norm, config.weight_decay)
 
     def optimizers(self) -> dict[str, ClippedAdam]:
         """All optimisers by name; the names are those of snapshots."""

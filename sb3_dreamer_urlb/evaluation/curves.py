@@ -12,7 +12,7 @@ from sb3_dreamer_urlb.evaluation.names import ALIASES, TASKS
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row, frames, texts
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, finish, frames_label, lines, new_figure
-from sb3_dreamer_urlb.phases import keeps_actor
+from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
 PANELS = 4
 #: value of ``keep_actor`` in a condition

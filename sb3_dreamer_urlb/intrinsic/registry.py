@@ -78,6 +78,9 @@ def make_intrinsic_reward(
         raise ValueError(
             f"intrinsic_reward must be a name, a subclass or an instance of {kind.__name__}, or None, got {method!r}."
         )
+    missing = sorted(getattr(chosen, "__abstractmethods__", ()))
+    if missing:
+        raise ValueError(f"intrinsic_reward: {chosen.__qualname__} does not say what its {' and '.join(missing)} is.")
     known = named_parameters(chosen)
     unknown = sorted(set(kwargs) - set(known))
     if unknown:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -39,7 +40,7 @@ class EncodedSteps:
     next_encoding: th.Tensor
 
 
-class TransitionReward(ExplorationMethod):
+class TransitionReward(ExplorationMethod, ABC):
     """A reward for replayed steps, in place of the task's while an agent without a world model pre-trains.
 
     A subclass takes its hyperparameters in ``__init__``, makes its networks in :meth:`build`, and says in :meth:`loss` what
@@ -68,9 +69,9 @@ class TransitionReward(ExplorationMethod):
         """
         return None
 
+    @abstractmethod
     def reward(self, steps: EncodedSteps) -> th.Tensor:
         """What each step is worth, float (B,). Called after the step on :meth:`loss`, without gradients.
 
         :param steps: detached
         """
-        raise NotImplementedError

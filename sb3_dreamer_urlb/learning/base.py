@@ -38,6 +38,8 @@ class BaseLearner(Generic[AnyAgent, Batch]):
     #: what an update does on the device, recorded if that is wanted and possible
     recorder: Recorder[Metrics]
     guard: UpdateGuard
+    #: the numbers of an update
+    config: Any
 
     def __init__(self, agent: AnyAgent, compile: str, precision: str, width: int):
         self.agent = agent
@@ -54,7 +56,20 @@ class BaseLearner(Generic[AnyAgent, Batch]):
         :param recorded: what may say, with ``graph_safe = False``, that an update cannot be recorded
         """
         self.guard = UpdateGuard(self.optimizers(), statistics)
+        self._recorded = recorded
         self._record_anew(recorded)
+
+    def configure(self, config: Any) -> None:
+        """Take other numbers from the next update on; step sizes are set apart, for they follow schedules.
+
+        :param config: of the learner's kind; differs in numbers only
+        """
+        self.config = config
+        for optimizer in self.optimizers().values():
+            optimizer.eps, optimizer.max_grad_norm = config.adam_eps, config.max_grad_norm
+            optimizer.weight_decay = config.weight_decay
+        # A recording holds the old ones.
+        self._record_anew(self._recorded)
 
     def _record_anew(self, recorded: nn.Module | None) -> None:
         """Forget recordings of updates.

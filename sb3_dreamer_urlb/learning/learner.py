@@ -76,18 +76,6 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
         statistics = [agent.reward_normalizer, *([] if agent.intrinsic is None else [agent.intrinsic])]
         self._get_ready(statistics, agent.intrinsic)
 
-    def configure(self, config: LearnerConfig) -> None:
-        """Take other numbers from the next update on; step sizes are set apart, for they follow schedules.
-
-        :param config: differs in numbers only
-        """
-        self.config = config
-        for optimizer in self.optimizers().values():
-            optimizer.eps, optimizer.weight_decay = config.adam_eps, config.weight_decay
-            optimizer.max_grad_norm = config.max_grad_norm
-        # A recording holds the old ones.
-        self._record_anew(self.agent.intrinsic)
-
     def _optimizer(self, module: nn.Module, learning_rate: float) -> ClippedAdam:
         config = self.config
         trained = [parameter for parameter in module.parameters() if parameter.requires_grad]

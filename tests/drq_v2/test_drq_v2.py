@@ -350,3 +350,8 @@ def test_the_store_on_the_device_changes_nothing(weights):
 def test_a_run_that_no_longer_learns_ends(tmp_path):
     with pytest.raises(NumericalFaultError, match="critic"):
         tiny(vec_env(rewards=[3e38]), tensorboard_log=str(tmp_path), train_freq=1).learn(200)
+
+
+def test_an_environment_without_end_is_learnt_from_as_soon_as_it_is_due():
+    model = tiny(vec_env(length=10**9)).learn(40)
+    assert model._n_updates == tiny(vec_env(length=8)).learn(40)._n_updates > 0

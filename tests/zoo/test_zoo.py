@@ -295,7 +295,7 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("callback:'nowhere.Callback'", "No module named 'nowhere'"),
         (f"callback:[{{'{SWITCH}': dict(frames=80)}}]", "got an unexpected keyword argument 'frames'"),
         ("monitor_kwargs:dict(overide=True)", "got an unexpected keyword argument 'overide'"),
-        ("replay_buffer_kwargs:dict(stor='x')", "got an unexpected keyword argument 'stor'"),
+        ("replay_buffer_kwargs:dict(stor='x')", "Unknown replay_buffer_kwargs ['stor']; known are"),
     ],
 )
 def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
