@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from abc import abstractmethod
 from contextlib import ExitStack
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases, transfer_rule
 from sb3_dreamer_urlb.algorithm import checks, normalized, training_loop
+from sb3_dreamer_urlb.algorithm.assigning import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
@@ -26,18 +26,10 @@ from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.types import MetricMeans
 
-
-@functools.cache
-def _watched_arguments(algorithm: type[PhasedAlgorithm]) -> frozenset[str]:
-    """The arguments of the class that says which of them may be assigned; what subclasses add is their own affair."""
-    owner = next(kind for kind in algorithm.__mro__ if "assignable" in vars(kind))
-    return frozenset(owner.argument_names())  # type: ignore[attr-defined]
-
-
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
 
-class PhasedAlgorithm(CollectingAlgorithm):
+class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     """An off-policy algorithm that pre-trains with an intrinsic reward and fine-tunes on a task (paper §2, §3).
 
     The base of every algorithm here, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
@@ -101,39 +93,6 @@ class PhasedAlgorithm(CollectingAlgorithm):
         #: of the updates since the last line of the log
         self._metrics = MetricMeans()
         self._logged_phase: str | None = None
-
-    # -- hyperparameters -----------------------------------------------------------------------------------------------
-
-    #: arguments that are in force from the next step or update on when they are assigned; None lets all be assigned unchecked
-    assignable: ClassVar[frozenset[str] | None] = None
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """What a model says of its arguments is what is in force, for files state it.
-
-        :raises AttributeError: for an argument that networks or replay were built with
-        :raises ValueError: for a value that does not fit; the old one stays
-        """
-        if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
-            super().__setattr__(name, value)
-            return
-        if name not in self.assignable:
-            raise AttributeError(
-                f"{name} cannot be assigned: the model was built with {name}={vars(self).get(name)!r}. "
-                f"To change it: {type(self).__name__}.load(path, {name}=...)."
-            )
-        before = vars(self)[name]
-        super().__setattr__(name, plain(value))
-        try:
-            self._put_in_force()
-        except Exception:
-            super().__setattr__(name, before)
-            raise
-
-    def _put_in_force(self) -> None:
-        """An argument was assigned: check all of them, and tell the parts that hold a copy.
-
-        :raises ValueError: for a value that does not fit; nothing is told yet
-        """
 
     # -- set-up --------------------------------------------------------------------------------------------------------
 

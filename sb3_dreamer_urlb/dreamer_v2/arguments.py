@@ -61,7 +61,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "precision",
     "compile",
 }
-#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.PhasedAlgorithm.assignable`
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assigning.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {
         "learning_rate", "actor_learning_rate", "critic_learning_rate", "adam_eps", "max_grad_norm", "weight_decay",

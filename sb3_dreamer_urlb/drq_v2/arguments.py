@@ -30,7 +30,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
 
 #: arguments of the replay that it fills in, too
 REPLAY_ARGUMENTS_OF_THE_MODEL = {"frame_stack", "n_steps", "gamma", "sampling"}
-#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.PhasedAlgorithm.assignable`
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assigning.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {
         "learning_rate", "adam_eps", "batch_size", "tau", "gamma", "noise_std", "noise_clip",

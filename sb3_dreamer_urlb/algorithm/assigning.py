@@ -1,0 +1,51 @@
+"""What happens when an argument is assigned on a model: it is in force from then on, or refused."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, ClassVar
+
+from sb3_dreamer_urlb.number_checks import plain
+from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+
+
+class AssignableArguments(SavedAlgorithm):
+    """What a model says of its arguments is what is in force, for files state it."""
+
+    #: arguments that are in force from the next step or update on when they are assigned; None lets all be assigned unchecked
+    assignable: ClassVar[frozenset[str] | None] = None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """As ever, but for arguments of a model that is built.
+
+        :raises AttributeError: for an argument that networks or replay were built with
+        :raises ValueError: for a value that does not fit; the old one stays
+        """
+        if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
+            super().__setattr__(name, value)
+            return
+        if name not in self.assignable:
+            raise AttributeError(
+                f"{name} cannot be assigned: the model was built with {name}={vars(self).get(name)!r}. "
+                f"To change it: {type(self).__name__}.load(path, {name}=...)."
+            )
+        before = vars(self)[name]
+        super().__setattr__(name, plain(value))
+        try:
+            self._put_in_force()
+        except Exception:
+            super().__setattr__(name, before)
+            raise
+
+    def _put_in_force(self) -> None:
+        """An argument was assigned: check all of them, and tell the parts that hold a copy.
+
+        :raises ValueError: for a value that does not fit; nothing is told yet
+        """
+
+
+@functools.cache
+def _watched_arguments(algorithm: type[AssignableArguments]) -> frozenset[str]:
+    """The arguments of the class that says which of them may be assigned; what subclasses add is their own affair."""
+    owner = next(kind for kind in algorithm.__mro__ if "assignable" in vars(kind))
+    return frozenset(owner.argument_names())  # type: ignore[attr-defined]
