@@ -21,7 +21,7 @@ from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
 from sb3_dreamer_urlb.types import Observation
 
 if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+    from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 
 #: frames a second where the environment does not say
 DEFAULT_FPS = 20.0
@@ -43,7 +43,7 @@ class Recording:
     fps: float
 
 
-def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None, argument: str = "env") -> VecEnv:
+def env_to_play_in(model: AgentAlgorithm, env: GymEnv | str | None = None, argument: str = "env") -> VecEnv:
     """An environment as the model takes it: vectorised, normalised with the model's own statistics.
 
     :param model: that is to play
@@ -73,7 +73,7 @@ def env_to_play_in(model: DreamerV2, env: GymEnv | str | None = None, argument: 
     return vec_env
 
 
-def _same_again(model: DreamerV2, argument: str) -> gymnasium.Env[Any, Any]:
+def _same_again(model: AgentAlgorithm, argument: str) -> gymnasium.Env[Any, Any]:
     train_env = model.get_env()
     spec = None if train_env is None else env_attribute(train_env, "spec", None)
     if train_env is None or spec is None:
@@ -84,7 +84,7 @@ def _same_again(model: DreamerV2, argument: str) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
 
 
-def _normalized_alike(model: DreamerV2, env: VecEnv) -> VecEnv:
+def _normalized_alike(model: AgentAlgorithm, env: VecEnv) -> VecEnv:
     own = model.get_vec_normalize_env()
     if own is None:
         return env
@@ -92,7 +92,7 @@ def _normalized_alike(model: DreamerV2, env: VecEnv) -> VecEnv:
     return VecNormalize(env, training=False, norm_reward=False, **settings)
 
 
-def copy_statistics(model: DreamerV2, env: VecEnv) -> None:
+def copy_statistics(model: AgentAlgorithm, env: VecEnv) -> None:
     """Give an environment the statistics that the model's observations are normalised with at present.
 
     :param model: that is to play
@@ -105,7 +105,7 @@ def copy_statistics(model: DreamerV2, env: VecEnv) -> None:
         other.ret_rms = copy.deepcopy(own.ret_rms)
 
 
-def check_visible(model: DreamerV2, env: VecEnv) -> None:
+def check_visible(model: AgentAlgorithm, env: VecEnv) -> None:
     """
     :param model: that is to play
     :param env: to play in
@@ -118,7 +118,7 @@ def check_visible(model: DreamerV2, env: VecEnv) -> None:
         )
 
 
-def check_drawn(model: DreamerV2, env: VecEnv) -> None:
+def check_drawn(model: AgentAlgorithm, env: VecEnv) -> None:
     """Draw once: whether an environment can, it only says when it is asked to. Resets it.
 
     :param model: that is to play
@@ -132,7 +132,7 @@ def check_drawn(model: DreamerV2, env: VecEnv) -> None:
 
 
 @th.no_grad()
-def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = True) -> Recording:
+def record(model: AgentAlgorithm, env: VecEnv, max_steps: int, deterministic: bool = True) -> Recording:
     """Play one episode with the model's memory threaded through, with the planner if it is on.
 
     :param model: that plays; it is not changed
@@ -159,7 +159,7 @@ def record(model: DreamerV2, env: VecEnv, max_steps: int, deterministic: bool = 
     return Recording(_stacked(observations), np.stack(actions), frames, float(fps))
 
 
-def _picture(model: DreamerV2, env: VecEnv, observation: Any) -> np.ndarray:
+def _picture(model: AgentAlgorithm, env: VecEnv, observation: Any) -> np.ndarray:
     if env.render_mode == "rgb_array":
         return _rendered(env)
     policy = model.policy

@@ -5,21 +5,20 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import stable_baselines3
 import torch as th
 
+from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
+from sb3_dreamer_urlb.hub.algorithms import SharedAlgorithm, algorithm_of
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.version import __version__, how_to_install
-
-if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 FROM_SCRATCH = "none, learnt from scratch"
 #: say something about the machine, or have a line of their own
@@ -40,6 +39,7 @@ class ModelFacts:
     :param planner: that acts in fine-tuning, or None
     :param seed: None for a run without
     :param command: that made it, None if nobody said
+    :param algorithm: name of its class
     """
 
     env_id: str
@@ -52,6 +52,7 @@ class ModelFacts:
     planner: str | None
     seed: int | None
     command: str | None
+    algorithm: str
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class Evaluation:
         return f"{self.mean_reward:.2f} +/- {self.std_reward:.2f}"
 
 
-def facts_about(model: DreamerV2, env_id: str, command: str | None) -> ModelFacts:
+def facts_about(model: AgentAlgorithm, env_id: str, command: str | None) -> ModelFacts:
     """What a model knows about itself.
 
     :param model: trained
@@ -96,15 +97,17 @@ def facts_about(model: DreamerV2, env_id: str, command: str | None) -> ModelFact
         pretrained_frames=(model.phase_frames if exploring else model.pretrained_frames) if known else None,
         frames=model.phase_frames,
         action_repeat=model.action_repeat,
-        planner=planner_name(model.planner),
+        planner=planner_name(getattr(model, "planner", None)),
         seed=model.seed,
         command=command,
+        algorithm=algorithm_of(model).name,
     )
 
 
-def metadata(facts: ModelFacts, evaluation: Evaluation) -> str:
+def metadata(algorithm: SharedAlgorithm, facts: ModelFacts, evaluation: Evaluation) -> str:
     """The YAML that the Hub reads: tags, and the return as its leaderboards expect it.
 
+    :param algorithm: the model's
     :param facts: about the model
     :param evaluation: its return
     :raises ImportError: if huggingface_hub is not installed
@@ -124,7 +127,7 @@ def metadata(facts: ModelFacts, evaluation: Evaluation) -> str:
         verified=False,
     )
     tags = [facts.env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3_dreamer_urlb"]
-    tags.append("dreamer-v2")
+    tags.append(algorithm.tag)
     if facts.domain:
         tags.append(facts.domain)
     if facts.method != FROM_SCRATCH:
@@ -133,14 +136,14 @@ def metadata(facts: ModelFacts, evaluation: Evaluation) -> str:
         library_name="stable-baselines3",
         pipeline_tag="reinforcement-learning",
         tags=tags,
-        model_name="DreamerV2",
+        model_name=algorithm.name,
         eval_results=[result],
     )
     return str(data.to_yaml())
 
 
 def model_card(
-    model: DreamerV2, facts: ModelFacts, evaluation: Evaluation, repo_name: str, normalized: bool, filmed: bool
+    model: AgentAlgorithm, facts: ModelFacts, evaluation: Evaluation, repo_name: str, normalized: bool, filmed: bool
 ) -> str:
     """The README.md of a repository.
 
@@ -162,16 +165,17 @@ def model_card(
         "return": f"{evaluation.text} (mean and standard deviation of {evaluation.n_eval_episodes} "
         f"{'deterministic' if evaluation.is_deterministic else 'stochastic'} episodes)",
     }
+    algorithm = algorithm_of(model)
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     command = f"```sh\n{facts.command}\n```" if facts.command else "The command was not recorded."
     hyperparameters = json.dumps(changed_arguments(model), indent=1, ensure_ascii=False)
     return f"""---
-{metadata(facts, evaluation).rstrip()}
+{metadata(algorithm, facts, evaluation).rstrip()}
 ---
 
-# DreamerV2 in `{facts.env_id}`
+# {algorithm.name} in `{facts.env_id}`
 
-A world model with an actor, trained with sb3_dreamer_urlb, DreamerV2 for
+{algorithm.about}, trained with sb3_dreamer_urlb, {algorithm.name} for
 [Stable-Baselines3](https://github.com/DLR-RM/stable-baselines3).
 {"`replay.mp4` shows it at work." if filmed else ""}
 
@@ -197,7 +201,7 @@ Files are JSON and safetensors: loading them runs no code.
 sb3_dreamer_urlb {__version__}, Stable-Baselines3 {stable_baselines3.__version__}, \
 torch {th.__version__}, gymnasium {gymnasium.__version__}, Python {sys.version.split()[0]}.
 
-Hyperparameters that differ from the defaults, which are the paper's
+Hyperparameters that differ from the defaults, which are the benchmark's
 ([ICML 2023](https://masteringurlb.github.io/)):
 
 ```json
@@ -236,11 +240,11 @@ def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
     lines = [
         *imports,
         "",
-        "from sb3_dreamer_urlb import DreamerV2",
+        f"from sb3_dreamer_urlb import {facts.algorithm}",
         f"from sb3_dreamer_urlb.hub import {names}",
         "",
         f"env = {env}",
-        f"model = DreamerV2.load(load_from_hub({json.dumps(repo_name)}), env=env)",
+        f"model = {facts.algorithm}.load(load_from_hub({json.dumps(repo_name)}), env=env)",
     ]
     if facts.phase == PRETRAINING:
         lines += ["model.fine_tune()  # keeps what was pre-trained", "model.learn(50_000)"]
@@ -260,7 +264,7 @@ def who_registers(env_id: str) -> tuple[list[str], bool]:
     return ([] if package in ("gymnasium", "sb3_dreamer_urlb") else [f"import {package}  # registers {env_id}"]), True
 
 
-def changed_arguments(model: DreamerV2) -> dict[str, Any]:
+def changed_arguments(model: AgentAlgorithm) -> dict[str, Any]:
     """Constructor arguments that are not the defaults, as JSON."""
     signature = named_parameters(type(model))
     kind = type(model.policy)

@@ -23,20 +23,21 @@ from tqdm import tqdm
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
+from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.snapshots import bounded_json
 from sb3_dreamer_urlb.snapshots.vec_normalize import save_vec_normalize
 
 if TYPE_CHECKING:
-    from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
+    from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 
 CARD, CONFIG, RESULTS, FILM, STATISTICS = "README.md", "config.json", "results.json", "replay.mp4", "vec_normalize.json"
 MAX_CONFIG = 1 << 20
 
 
 def package_to_hub(
-    model: DreamerV2,
+    model: AgentAlgorithm,
     repo_id: RepoId,
     eval_env: GymEnv | str | None = None,
     n_eval_episodes: int = 10,
@@ -45,7 +46,7 @@ def package_to_hub(
     env_id: str | None = None,
     model_name: str | None = None,
     video_length: int = 500,
-    commit_message: str = "Add a DreamerV2 model",
+    commit_message: str | None = None,
     token: str | None = None,
     private: bool | None = None,
     extra_files: Mapping[str, str | os.PathLike[str]] | None = None,
@@ -53,11 +54,11 @@ def package_to_hub(
 ) -> str:
     """Evaluate a model, film it, describe it, and put all of it into a repository.
 
-    The repository gets ``<model_name>.zip`` (:meth:`DreamerV2.save`), ``README.md`` (the model card), ``config.json``,
+    The repository gets ``<model_name>.zip`` (its own ``save``), ``README.md`` (the model card), ``config.json``,
     ``results.json``, ``replay.mp4``, and ``vec_normalize.json`` where observations are normalised. Nothing is uploaded if
     any of it fails, but a film: without pictures there is none, and a warning says so.
 
-    :param model: trained
+    :param model: trained, a :class:`~sb3_dreamer_urlb.DreamerV2` or a :class:`~sb3_dreamer_urlb.DrQv2`
     :param repo_id: ``"user/name"`` on the Hub; a folder as a ``Path``, ``"./path"``, ``"/path"`` or ``"file:///path"``
     :param eval_env: to evaluate in: a VecEnv of one environment, used as it is, an environment or its id; None makes one
         like the model's own
@@ -65,9 +66,9 @@ def package_to_hub(
     :param deterministic: evaluate without exploration
     :param command: that made the model, for the card; keep secrets out of it
     :param env_id: name of the environment; None asks ``eval_env``
-    :param model_name: None for ``dreamerv2-<env_id>``, as rl_zoo3 names it
+    :param model_name: None for ``dreamerv2-<env_id>`` or ``drq_v2-<env_id>``, as rl_zoo3 names it
     :param video_length: agent steps of the film at most, 0 for none
-    :param commit_message: on the Hub
+    :param commit_message: on the Hub; None names the algorithm
     :param token: of the Hub; None takes the one of ``hf auth login``, or ``HF_TOKEN``
     :param private: whether a repository that is made on the Hub is private
     :param extra_files: further files, by their names in the repository
@@ -77,6 +78,7 @@ def package_to_hub(
         only the caller can give, and has not, is named all at once
     :raises ImportError: if the extra ``hub`` is not installed
     """
+    algorithm = algorithm_of(model)
     check_integer("n_eval_episodes", n_eval_episodes, 1)
     check_integer("video_length", video_length, 0)
     check_installed(film=video_length > 0)
@@ -86,7 +88,7 @@ def package_to_hub(
     try:
         recording.copy_statistics(model, env)
         env_id = env_id or _id_of(env)
-        model_file = check_filename(f"{model_name or name_of_model(env_id)}.zip")
+        model_file = check_filename(f"{model_name or name_of_model(env_id, algorithm.zoo)}.zip")
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
             model.save(folder / model_file)
@@ -104,7 +106,7 @@ def package_to_hub(
                 target = folder / check_filename(name)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
-            return repository.upload(folder, commit_message)
+            return repository.upload(folder, commit_message or f"Add a {algorithm.name} model")
     finally:
         if eval_env is None or isinstance(eval_env, str):
             env.close()
@@ -134,9 +136,9 @@ def push_to_hub(
 
 
 def load_from_hub(repo_id: RepoId, filename: str | None = None, revision: str | None = None, token: str | None = None) -> str:
-    """Fetch a file: ``DreamerV2.load(load_from_hub("user/name"), env=env)``.
+    """Fetch a file: ``DreamerV2.load(load_from_hub("user/name"), env=env)``, or ``DrQv2.load``, as the card says.
 
-    Fetching runs no code from the file, and neither does ``DreamerV2.load``, whoever made it.
+    Fetching runs no code from the file, and neither does ``load``, whoever made it.
 
     :param repo_id: see :func:`package_to_hub`
     :param filename: in the repository; None for the model that :func:`package_to_hub` put there
@@ -156,8 +158,12 @@ def load_from_hub(repo_id: RepoId, filename: str | None = None, revision: str | 
     return str(repository.download(check_filename(filename)))
 
 
-def name_of_model(env_id: str, algo: str = "dreamerv2") -> str:
-    """As rl_zoo3 calls models: the slash of an id becomes a dash."""
+def name_of_model(env_id: str, algo: str) -> str:
+    """As rl_zoo3 calls models: the slash of an id becomes a dash.
+
+    :param env_id: of the environment
+    :param algo: what stands behind ``--algo``
+    """
     return f"{algo}-{env_id.replace('/', '-')}"
 
 
@@ -172,7 +178,10 @@ def check_installed(film: bool) -> None:
 
 
 def _check_given(
-    model: DreamerV2, eval_env: GymEnv | str | None, env_id: str | None, extra_files: Mapping[str, str | os.PathLike[str]]
+    model: AgentAlgorithm,
+    eval_env: GymEnv | str | None,
+    env_id: str | None,
+    extra_files: Mapping[str, str | os.PathLike[str]],
 ) -> None:
     """
     :raises ValueError: naming everything that is missing
@@ -205,7 +214,7 @@ def _id_of(env: VecEnv) -> str:
 
 
 def _evaluate(
-    model: DreamerV2, env: VecEnv, episodes: int, deterministic: bool, progress_bar: bool = False
+    model: AgentAlgorithm, env: VecEnv, episodes: int, deterministic: bool, progress_bar: bool = False
 ) -> cards.Evaluation:
     with tqdm(total=episodes, desc="Evaluating", unit="episode", disable=not progress_bar) as bar:
 
@@ -219,7 +228,7 @@ def _evaluate(
     return cards.Evaluation(float(mean), float(np.mean(std)), episodes, deterministic, now)
 
 
-def _film(model: DreamerV2, env: VecEnv, video_length: int, deterministic: bool, path: Path) -> bool:
+def _film(model: AgentAlgorithm, env: VecEnv, video_length: int, deterministic: bool, path: Path) -> bool:
     try:
         played = recording.record(model, env, video_length, deterministic)
     except ValueError as error:

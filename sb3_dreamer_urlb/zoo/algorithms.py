@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.drq_v2 import DrQv2
 from sb3_dreamer_urlb.zoo.sampler import convert_params, sample_dreamer_v2_params, sample_drq_v2_params
@@ -22,7 +22,7 @@ class ZooAlgorithm:
     :param converter: from a study's numbers to constructor arguments
     """
 
-    kind: type[PhasedAlgorithm]
+    kind: type[AgentAlgorithm]
     sampler: Callable[..., dict[str, Any]]
     configs: tuple[str, ...]
     converter: Callable[[dict[str, Any]], dict[str, Any]] = convert_params

@@ -1,4 +1,4 @@
-"""rl_zoo3's ``push_to_hub`` and ``load_from_hub`` for DreamerV2, with the arguments that they have there.
+"""rl_zoo3's ``push_to_hub`` and ``load_from_hub`` for our algorithms, with the arguments that they have there.
 
 rl_zoo3's own push does not start with the present sb3-team-hf-integration. And what rl_zoo3 reads from a
 run's folder it reads with loaders that run code: here nothing of a downloaded repository reaches them unchecked.
@@ -17,12 +17,9 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
-
-#: rl_zoo3's name of the algorithm that these commands share
-ALGORITHM = "dreamerv2"
+from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 
 CONFIG, ARGUMENTS, ENV_KWARGS, METRICS = "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip"
 #: of the command line that trained; the rest names things of that machine
@@ -44,7 +41,7 @@ def push(argv: Sequence[str], prog: str) -> str:
     which.add_argument("--load-best", action="store_true", help="the best model of the evaluations")
     which.add_argument("--load-checkpoint", type=int, help="a checkpoint, by its number of steps")
     which.add_argument("--load-last-checkpoint", action="store_true")
-    parser.add_argument("-m", "--commit-message", default="Add a DreamerV2 model")
+    parser.add_argument("-m", "--commit-message", help="(default: names the algorithm)")
     parser.add_argument("-n", "--n-timesteps", type=int, default=500, help="agent steps of the film (default: 500)")
     parser.add_argument("--no-render", action="store_true", help="no film")
     parser.add_argument("--n-eval-episodes", type=int, default=10)
@@ -73,7 +70,7 @@ def push(argv: Sequence[str], prog: str) -> str:
         hyperparams={**hyperparameters},
         env_kwargs=env_kwargs if options.no_render else {"render_mode": "rgb_array", **env_kwargs},
     )
-    model = DreamerV2.load(model_path, device=options.device)
+    model = ALGORITHMS[options.algo].kind.load(model_path, device=options.device)
     try:
         with tempfile.TemporaryDirectory() as folder:
             return package_to_hub(
@@ -84,7 +81,7 @@ def push(argv: Sequence[str], prog: str) -> str:
                 deterministic=not options.stochastic,
                 command=_command(run),
                 env_id=options.env,
-                model_name=name_of_model(options.env),
+                model_name=name_of_model(options.env, options.algo),
                 video_length=0 if options.no_render else options.n_timesteps,
                 commit_message=options.commit_message,
                 private=options.private or None,
@@ -120,8 +117,8 @@ def load(argv: Sequence[str], prog: str) -> str:
     def fetch(name: str) -> str:
         return load_from_hub(repo_id, name, options.revision)
 
-    model = fetch(f"{name_of_model(options.env)}.zip")
-    DreamerV2.load(model, device="cpu")  # refuses what is no model of ours, before anything is written
+    model = fetch(f"{name_of_model(options.env, options.algo)}.zip")
+    ALGORITHMS[options.algo].kind.load(model, device="cpu")  # refuses what is no model of ours, before anything is written
     config = harmless_config(_read_yaml(fetch(CONFIG)))
     env_kwargs = _read_yaml(fetch(ENV_KWARGS))
     statistics = None
@@ -154,7 +151,7 @@ def harmless_config(config: dict[str, Any]) -> dict[str, Any]:
     if wrappers:
         raise ValueError(
             f"{CONFIG} names code to run: {wrappers[0]}={config[wrappers[0]]!r}. Wrap the environment yourself, and use "
-            "DreamerV2.load(load_from_hub(...), env=env)."
+            "load(load_from_hub(...), env=env) of the algorithm."
         )
     stack = config.get("frame_stack", 0)
     if type(stack) is not int or stack < 0:
@@ -167,7 +164,7 @@ def _parser(prog: str, description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=prog, description=description)
     parser.add_argument("--env", required=True, help="id of the environment")
     parser.add_argument("-f", "--folder", required=True, help="of the runs")
-    parser.add_argument("--algo", default=ALGORITHM, choices=[ALGORITHM])
+    parser.add_argument("--algo", default="dreamerv2", choices=sorted(ALGORITHMS))
     parser.add_argument("-orga", "--organization", required=True, help="user or organisation; or a folder: ./path, /path")
     parser.add_argument("-name", "--repo-name", help="of the repository (default: the algorithm and the environment)")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run (0: the latest, or a new one)")
@@ -176,7 +173,7 @@ def _parser(prog: str, description: str) -> argparse.ArgumentParser:
 
 
 def _repo_id(options: argparse.Namespace) -> str:
-    return f"{options.organization.rstrip('/')}/{options.repo_name or name_of_model(options.env)}"
+    return f"{options.organization.rstrip('/')}/{options.repo_name or name_of_model(options.env, options.algo)}"
 
 
 def _zoo_name(env_id: str) -> Any:

@@ -26,7 +26,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_dreamer_urlb
-from sb3_dreamer_urlb import DreamerV2, SnapshotError
+from sb3_dreamer_urlb import DreamerV2, DrQv2, SnapshotError
 from sb3_dreamer_urlb.hub import load_from_hub, load_vec_normalize, package_to_hub, push_to_hub, save_vec_normalize
 from sb3_dreamer_urlb.hub import package as packaging
 from sb3_dreamer_urlb.hub.model_card import who_registers
@@ -135,6 +135,26 @@ def test_the_cards_of_other_models(tiny_model, tmp_path, kind):
         "old": ["an unknown number of pre-training, then 0 on the task"],
     }
     assert all(line in text for line in stated[kind])
+
+
+def test_an_agent_without_a_world_model_goes_there_and_its_card_loads_it(weights, tmp_path):
+    env = gymnasium.make(ID)
+    model = DrQv2("CnnPolicy", env, preset="tiny", intrinsic_reward="disagreement", seed=3, device="cpu").learn(20)
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=3)
+    text = card(tmp_path).text
+    assert "# DrQv2 in `test/Counter-v0`" in text and "| planner | none |" in text and "world model" not in text
+    assert "DreamerV2" not in (tmp_path / "README.md").read_text()
+    assert card(tmp_path).data.model_name == "DrQv2" and "drq-v2" in card(tmp_path).data.tags
+    path = load_from_hub(tmp_path)
+    assert Path(path).name == "drq_v2-test-Counter-v0.zip" and "model = DrQv2.load(" in text
+    loaded = DrQv2.load(path, env=env, device="cpu")
+    assert weights(loaded.policy) == weights(model.policy) and (tmp_path / "replay.mp4").is_file()
+
+
+def test_other_algorithms_models_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="A model of DreamerV2 or DrQv2 can be shared, got PPO"):
+        package_to_hub(PPO("MlpPolicy", "Pendulum-v1", n_steps=8, device="cpu"), tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["images", "normalised vectors"])
