@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 
 STORED = {
     "planner_kwargs": {"n_samples": 8, "iterations": 2, "top_k": 4, "mixture": 0.25, "horizon": 3},
@@ -22,6 +23,14 @@ CHANGES = {
     "replay_buffer_kwargs": {"store": "memory", "max_episode_rows": 40},
     "intrinsic_kwargs": {"k": 2},
 }
+
+
+class Judged(SequenceReplayBuffer):
+    """A replay with an argument that no file can hold."""
+
+    def __init__(self, *args, judge=None, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.judge = judge
 
 
 def envs(n):
@@ -69,13 +78,15 @@ def test_only_what_no_file_can_hold_must_be_given_again():
     def judge(episode):
         return 1.0
 
-    model = new_model(intrinsic_reward=None, intrinsic_kwargs=None)
-    # Past the model, which takes no assignment of what its replay was built with.
-    vars(model)["replay_buffer_kwargs"] = {**model.replay_buffer_kwargs, "judge": judge}
-    file = file_of(model.save)
-    # The buffer of this package takes no such argument, a user's own might.
+    kwargs = {**STORED["replay_buffer_kwargs"], "judge": judge}
+    model = new_model(intrinsic_reward=None, intrinsic_kwargs=None, replay_buffer_class=Judged, replay_buffer_kwargs=kwargs)
+    with pytest.warns(UserWarning, match="replay_buffer"):
+        file = file_of(model.save)
+    again = {"replay_buffer_class": Judged}
     with pytest.raises(ValueError, match=r"its replay_buffer_kwargs was .*judge"):
-        DreamerV2.load(file, device="cpu")
+        DreamerV2.load(file, device="cpu", custom_objects=again)
+    loaded = DreamerV2.load(file, device="cpu", custom_objects={**again, "replay_buffer_kwargs": {"judge": judge}})
+    assert loaded.replay_buffer.judge is judge and loaded.replay_buffer.max_episode_rows == 50
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 3), (3, 1), (2, 3)])
