@@ -83,7 +83,7 @@ setup-gl:  ## only make the virtual environment, and see to a GL library
 	@scripts/setup.sh gl
 
 clean:  ## remove caches and build output
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis demo_output site
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis demo_output demo_pixels_output site
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 clean-venv: clean  ## remove the virtual environment, too

@@ -237,7 +237,7 @@ def docstrings_look_as_they_are_meant(site):
 
 def pages_and_code_come_from_outside_of_docs(site):
     start = (site / "index.html").read_text()
-    assert 'href="concepts/"' in start and 'src="images/learning_curve.png"' in start
+    assert 'href="concepts/"' in start and 'src="images/evidence.png"' in start
     code = (site / "source/sb3_dreamer_urlb/intrinsic/lbs.py/index.html").read_text()
     assert "class LBS" in re.sub(r"<[^>]*>", "", code)
     notebook = (site / "quickstart/index.html").read_text()
