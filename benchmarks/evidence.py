@@ -37,6 +37,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback, __version__
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.rows import Row
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize, save_vec_normalize
 
 ROOT = Path(__file__).parents[1] / "results" / "evidence"
 PRESET = "state-small"
@@ -116,17 +117,11 @@ def make_env(task: str, seed: int, statistics: Path | None = None, training: boo
     name, which = (f"urlb/walker-{task}-v0", {}) if body == "walker" else (SUITE, {"domain": body, "task": task})
     env = DummyVecEnv([lambda: Monitor(gymnasium.make(name, observation="state", **which))] * n_envs)
     env.seed(seed)
-    normalized = VecNormalize(env, norm_reward=False, training=training)
-    if statistics is not None:
-        with np.load(statistics) as file:
-            rms = normalized.obs_rms
-            rms.mean, rms.var, rms.count = file["mean"], file["var"], float(file["count"])
+    if statistics is None:
+        return VecNormalize(env, training=training, norm_reward=False)
+    normalized = load_vec_normalize(statistics, env, training)
+    normalized.norm_reward = False
     return normalized
-
-
-def save_statistics(env: VecNormalize, path: Path) -> None:
-    """Without pickles."""
-    np.savez(path, mean=env.obs_rms.mean, var=env.obs_rms.var, count=env.obs_rms.count)
 
 
 class Episodes(BaseCallback):
@@ -152,7 +147,7 @@ class Episodes(BaseCallback):
 
 
 def snapshot_of(pretraining: Run) -> Path:
-    """Where a pre-trained agent lies; its statistics beside it, ``.npz``."""
+    """Where a pre-trained agent lies; the statistics of its observations lie beside it."""
     body = "" if pretraining.body == "walker" else f"{pretraining.body}-"
     return ROOT / "snapshots" / f"{body}{pretraining.arm}-{pretraining.seed}.zip"
 
@@ -161,7 +156,7 @@ def begin(run: Run, folder: Path) -> tuple[DreamerV2, int]:
     """A model at the beginning of its run, or where the run was left, and how many agent steps it has in all."""
     method, keep_actor = (run.arm, False) if not run.task else ARMS[run.arm]
     source = None if run.needs is None else snapshot_of(run.needs)
-    start = None if source is None else source.with_suffix(".npz")
+    start = None if source is None else beside(source)
     env = make_env(run.task or PRIMAL[run.body], run.seed if not run.task else 1000 + run.seed, start)
     left = DreamerV2.resume(folder, env, device="cpu")
     if left is not None:
@@ -194,7 +189,7 @@ def do(run: Run) -> None:
             optimizer.adam.state.clear()
         path = snapshot_of(run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_statistics(env, path.with_suffix(".npz"))
+        save_vec_normalize(env, beside(path))
         model.save(path)
     record(run, episodes.rows())
     shutil.rmtree(folder)
@@ -212,12 +207,12 @@ def record(run: Run, episodes: list[tuple[int, float]]) -> None:
 
 def score(run: Run, model: DreamerV2, env: VecNormalize, folder: Path) -> None:
     """Ten episodes with the actor alone and ten with Dyna-MPC, each from a start of its own and all at once, as rows."""
-    save_statistics(env, folder / "statistics.npz")
+    save_vec_normalize(env, beside(folder / "final.zip"))
     model.save(folder / "final.zip")
     method, keep_actor = ARMS[run.arm]
     rows = []
     for planner in (None, "dyna_mpc"):
-        unseen = make_env(run.task, EVALUATION_SEED + EPISODES * run.seed, folder / "statistics.npz", False, EPISODES)
+        unseen = make_env(run.task, EVALUATION_SEED + EPISODES * run.seed, beside(folder / "final.zip"), False, EPISODES)
         agent = DreamerV2.load(folder / "final.zip", env=unseen, device="cpu", planner=planner)
         began = time.monotonic()
         returns, _ = evaluate_policy(agent, unseen, EPISODES, return_episode_rewards=True)

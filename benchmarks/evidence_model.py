@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.open_loop import predict_open_loop
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside
 
 #: observations that a model sees; steps that it then predicts
 CONTEXT, AHEAD = 5, (1, 5, 15)
@@ -71,7 +72,7 @@ def measure(task: str, seed: int) -> list[tuple[str, int, list[float]]]:
     episodes, found = held_out(task, seed), []
     source = evidence.snapshot_of(evidence.Run("lbs", "", seed))
     if source.exists():
-        env = evidence.make_env(task, seed, source.with_suffix(".npz"), training=False)
+        env = evidence.make_env(task, seed, beside(source), training=False)
         found.append(("lbs", 0, errors(DreamerV2.load(source, env=env, device="cpu"), env, episodes)))
     env = evidence.make_env(task, 1000 + seed)
     scratch = DreamerV2("MlpPolicy", env, preset=evidence.PRESET, seed=seed, device="cpu")

@@ -20,7 +20,7 @@ from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.episodes import OFF, ON, run_evaluation
 from sb3_dreamer_urlb.evaluation.recording import record
-from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize, save_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize, save_vec_normalize
 
 #: frames of a film, and its side in pixels
 FILM_STEPS, FILM_SIDE = 150, 192
@@ -38,7 +38,7 @@ class Agent:
     :param seed: of everything random
     :param preset: of the model
     :param snapshot: pre-trained agent that it starts from; None starts from nothing. The statistics of its observations lie
-        beside it, ``.json``
+        beside it
     :param episodes: of the evaluation at its end
     """
 
@@ -53,7 +53,7 @@ class Agent:
     @property
     def statistics(self) -> Path | None:
         """Of the observations that the snapshot was trained on."""
-        return None if self.snapshot is None else self.snapshot.with_suffix(".json")
+        return None if self.snapshot is None else beside(self.snapshot)
 
 
 def make_env(env_id: str, n_envs: int = 1, statistics: Path | None = None, training: bool = True, monitor: str | None = None,
@@ -137,13 +137,13 @@ def _learn(agent: Agent, model: DreamerV2) -> None:
 def _save(model: DreamerV2, path: Path) -> Path:
     env = model.get_vec_normalize_env()
     assert env is not None
-    save_vec_normalize(env, path.with_suffix(".json"))
+    save_vec_normalize(env, beside(path))
     model.save(path)
     return path
 
 
 def _play(agent: Agent, finished: Path) -> None:
-    statistics = finished.with_suffix(".json")
+    statistics = beside(finished)
     env = make_env(agent.env_id, agent.episodes, statistics, training=False)
     model = DreamerV2.load(finished, env=env, device="cpu", planner="dyna_mpc")
     played = [run_evaluation(model, env, agent.episodes, planner=planner) for planner in (OFF, ON)]

@@ -15,7 +15,7 @@ from sb3_dreamer_urlb.cli.demo_pictures import curves, film
 from sb3_dreamer_urlb.cli.pace import Pace
 from sb3_dreamer_urlb.cli.side_by_side import PRETRAINED, SCRATCH, SHIPPED, DemoConfig, run_demo
 from sb3_dreamer_urlb.evaluation.rows import read_rows
-from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 
 
 def test_everything_promised_is_written(tmp_path, capsys):
@@ -54,7 +54,7 @@ def test_the_agent_that_ships_explored_without_a_reward():
         "pretraining",
         40_000,
     )
-    env = demo_agents.make_env("urlb/walker-flip-v0", statistics=SHIPPED.with_suffix(".json"))
+    env = demo_agents.make_env("urlb/walker-flip-v0", statistics=beside(SHIPPED))
     assert env.obs_rms.count > 20_000 and env.training and not env.norm_reward
 
 
@@ -69,8 +69,8 @@ def test_the_shipped_agent_learns_another_task(tmp_path, monkeypatch):
         pairs = zip(before.policy.agent.get_submodule(part).parameters(),
                     after.policy.agent.get_submodule(part).parameters(), strict=True)  # fmt: skip
         assert all((one == other).all() for one, other in pairs)
-    count = load_vec_normalize(SHIPPED.with_suffix(".json"), demo_agents.make_env(agent.env_id).venv).obs_rms.count
-    moved = load_vec_normalize(finished.with_suffix(".json"), demo_agents.make_env(agent.env_id).venv).obs_rms.count
+    count = load_vec_normalize(beside(SHIPPED), demo_agents.make_env(agent.env_id).venv).obs_rms.count
+    moved = load_vec_normalize(beside(finished), demo_agents.make_env(agent.env_id).venv).obs_rms.count
     assert moved >= count + 500
 
 
