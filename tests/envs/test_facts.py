@@ -20,6 +20,7 @@ OURS = {
     "domain": ["jaco", "x"],
     "max_episode_steps": [9],
     "never_terminates": [True, np.False_],
+    "task": ["run", "x"],
 }
 FOREIGN = st.one_of(
     st.tuples(st.floats(), st.floats()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from dataclasses import replace
 from typing import Any
@@ -27,6 +28,7 @@ from sb3_dreamer_urlb.evaluation.aggregate import (
 from sb3_dreamer_urlb.evaluation.names import TASKS
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M, NORMALIZERS, ORACLE, URLB_EXPERT, normalized_score
+from sb3_dreamer_urlb.version import how_to_install
 
 ROW = Row("lbs", "walker", "run", 0, 2_000_000, 100_000, True, False, "dyna_mpc", "paper", 596.0, 17.0, 10)
 
@@ -156,6 +158,6 @@ def test_a_single_seed_has_no_interval() -> None:
 def test_without_rliable_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rliable", None)
     for act in (lambda: iqm({}), lambda: performance_profile({}, [0.5]), lambda: probability_of_improvement({}, {})):
-        with pytest.raises(ImportError, match=r"need rliable: pip install '\.\[plots\]'"):
+        with pytest.raises(ImportError, match=re.escape(f"need rliable; {how_to_install('plots')}")):
             act()
     assert aggregate.mean_and_error({"walker-run": [1.0]}).value == 1.0

@@ -101,8 +101,10 @@ def test_layers_on_tiles(tiles, seeded, monkeypatch, kind, kernel, size, elu, dt
         assert len(its) == (3 if compile == "native" else 0)
         assert y.dtype == dtype and all(grad.dtype == th.float32 for grad in found)
         results.append((y, *found))
-    for a, b in zip(*results, strict=True):
-        assert a.shape == b.shape and (a - b).abs().max() <= 16 * ROUNDING[dtype] * b.abs().max()
+    for i, (a, b) in enumerate(zip(*results, strict=True)):
+        # Gradients of parameters are sums over up to 80 · 30 · 30 places, in another order.
+        slack = 16 if i < 2 else 64
+        assert a.shape == b.shape and (a - b).abs().max() <= slack * ROUNDING[dtype] * b.abs().max()
 
 
 def test_only_what_is_asked_for(tiles, seeded):
