@@ -15,6 +15,7 @@ import struct
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import gymnasium
@@ -52,10 +53,11 @@ def serve(remote: Connection, env_fn: Any, name: str, max_faults: int) -> None:
                 if env is None:
                     # The first command, so that an error on the way is answered like any other.
                     env = FaultGuard(env_fn.var(), max_faults, name)
-                answer = (number, OK, _COMMANDS[command](env, data))
+                answer = ForkingPickler.dumps((number, OK, _COMMANDS[command](env, data)))
             except Exception as error:
-                answer = (number, RAISED, _portable(error))
-            remote.send(answer)
+                # Of the environment, or of an answer that cannot be sent.
+                answer = ForkingPickler.dumps((number, RAISED, _portable(error)))
+            remote.send_bytes(answer)
     except (EOFError, OSError):
         pass  # the parent is gone
     if env is not None:

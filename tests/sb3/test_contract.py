@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import pickle
 
 import gymnasium
 import numpy as np
+
 import pytest
 import torch as th
 from fake_envs import CounterEnv
@@ -14,13 +16,16 @@ from gymnasium.wrappers import TimeLimit
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, register_intrinsic_reward
 from sb3_dreamer_urlb.dreamer_v2.policies import MlpPolicy
+from sb3_dreamer_urlb.envs import SupervisedVecEnv
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
+from sb3_dreamer_urlb.envs.told import STEPS, TOLD, Asked, as_received
 from sb3_dreamer_urlb.intrinsic import APT
 from sb3_dreamer_urlb.intrinsic.registry import make_intrinsic_reward
 from sb3_dreamer_urlb.signatures import named_arguments, named_parameters
@@ -289,12 +294,31 @@ def test_an_episode_is_as_long_as_the_smallest_of_all_limits(own, spec, wrappers
     assert steps_an_episode(DummyVecEnv([lambda: env])) == min(limits, default=None)
 
 
+def from_another_process(env, name):
+    """What comes through the pipe of a worker, without one."""
+    assert is_wrapped(env, Asked)
+    return as_received(pickle.loads(pickle.dumps(env.get_wrapper_attr(TOLD)))[name])
+
+
+@given(COUNT, st.lists(st.tuples(st.sampled_from([TimeLimit, Told]), st.integers(2, 60)), max_size=3))
+def test_so_it_is_in_other_processes_with_and_without_a_spec(own, wrappers):
+    for make in (CounterEnv, lambda: gymnasium.make("OfTimeLimits-v0")):
+        env = make()
+        if own is not None:
+            env.unwrapped.max_episode_steps = own
+        for wrapper, steps in wrappers:
+            env = wrapper(env, steps)
+        limits = [limit for limit in (own, *(steps for _, steps in wrappers)) if limit is not None]
+        assert from_another_process(Monitor(env), STEPS) == min(limits, default=None)
+
+
 def short_env():
-    return TimeLimit(gymnasium.make("CartPole-v1", max_episode_steps=9), 5)
+    return TimeLimit(TimeLimit(TimeLimit(CounterEnv(), 9), 5), 7)
 
 
-def test_time_limits_of_environments_in_other_processes():
-    env = SubprocVecEnv([short_env], start_method="forkserver")
+@pytest.mark.parametrize("vec_env", [lambda fns: SubprocVecEnv(fns, start_method="forkserver"), SupervisedVecEnv])
+def test_time_limits_of_environments_in_other_processes(vec_env):
+    env = vec_env([short_env])
     try:
         assert steps_an_episode(env) == 5
     finally:
