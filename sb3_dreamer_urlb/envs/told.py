@@ -79,7 +79,12 @@ def fewest_steps(told: dict[str, Any], of_wrappers: Sequence[Any] = ()) -> int |
     :param of_wrappers: further numbers, of wrappers that do not hand their arguments to the spec
     """
     spec = told["spec"]
-    counts = [told["max_episode_steps"], told.get("_max_episode_steps"), getattr(spec, "max_episode_steps", None), *of_wrappers]
+    counts = [
+        told["max_episode_steps"],
+        told.get("_max_episode_steps"),
+        getattr(spec, "max_episode_steps", None),
+        *of_wrappers,
+    ]
     counts += [(wrapper.kwargs or {}).get("max_episode_steps") for wrapper in getattr(spec, "additional_wrappers", ())]
     return min((int(count) for count in map(plain, counts) if is_count(count)), default=None)
 

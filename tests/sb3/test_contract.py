@@ -7,7 +7,6 @@ import pickle
 
 import gymnasium
 import numpy as np
-
 import pytest
 import torch as th
 from fake_envs import CounterEnv
