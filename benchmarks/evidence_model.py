@@ -16,14 +16,15 @@ import csv
 from pathlib import Path
 
 import evidence
+import evidence_study as study
 import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.open_loop import predict_open_loop
-from sb3_dreamer_urlb.snapshots.vec_normalize import beside
 
+STATES = study.SETTINGS["state"]
 #: observations that a model sees; steps that it then predicts
 CONTEXT, AHEAD = 5, (1, 5, 15)
 EPISODES, STRIDE = 5, 20
@@ -33,10 +34,17 @@ STEPS = (2000, 5000, 10_000)
 Episode = tuple[np.ndarray, np.ndarray]
 
 
+def make_env(task: str, seed: int, snapshot: Path | None = None, training: bool = True) -> VecNormalize:
+    """As in ``evidence.py``, from states."""
+    env = evidence.make_env(STATES, task, seed, snapshot, training)
+    assert isinstance(env, VecNormalize)
+    return env
+
+
 def held_out(task: str, seed: int) -> list[Episode]:
     """States as they are, float (501, N), and actions, float (500, A), of a fresh actor that draws its actions."""
-    env = evidence.make_env(task, 20_000 + seed)
-    actor = DreamerV2("MlpPolicy", env, preset=evidence.PRESET, seed=20_000 + seed, device="cpu")
+    env = make_env(task, 20_000 + seed)
+    actor = DreamerV2("MlpPolicy", env, preset=STATES.preset, seed=20_000 + seed, device="cpu")
     found = []
     for _ in range(EPISODES):
         seen, state, start = env.reset(), None, np.ones(1, bool)
@@ -70,12 +78,12 @@ def errors(model: DreamerV2, env: VecNormalize, episodes: list[Episode]) -> list
 def measure(task: str, seed: int) -> list[tuple[str, int, list[float]]]:
     """Name of the agent, agent steps of the task that it has seen, errors."""
     episodes, found = held_out(task, seed), []
-    source = evidence.snapshot_of(evidence.Run("lbs", "", seed))
+    source = study.snapshot_of(study.Run("lbs", "", seed))
     if source.exists():
-        env = evidence.make_env(task, seed, beside(source), training=False)
+        env = make_env(task, seed, source, training=False)
         found.append(("lbs", 0, errors(DreamerV2.load(source, env=env, device="cpu"), env, episodes)))
-    env = evidence.make_env(task, 1000 + seed)
-    scratch = DreamerV2("MlpPolicy", env, preset=evidence.PRESET, seed=seed, device="cpu")
+    env = make_env(task, 1000 + seed)
+    scratch = DreamerV2("MlpPolicy", env, preset=STATES.preset, seed=seed, device="cpu")
     for steps in STEPS:
         scratch.learn(steps - scratch.num_timesteps, reset_num_timesteps=scratch.num_timesteps == 0)
         found.append(("scratch", steps, errors(scratch, env, episodes)))
@@ -87,7 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--task", default="run", help="of the walker")
-    parser.add_argument("--out", type=Path, default=evidence.ROOT / "open_loop.csv")
+    parser.add_argument("--out", type=Path, default=study.ROOT / "open_loop.csv")
     options = parser.parse_args()
     th.set_num_threads(1)
     print(f"{'seed':>4} {'agent':<8} {'steps of the task':>18}" + "".join(f"{f'{ahead} ahead':>10}" for ahead in AHEAD))

@@ -16,11 +16,11 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import evidence
+import evidence_study as study
 import numpy as np
 
 from sb3_dreamer_urlb.evaluation.aggregate import iqm
-from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 from sb3_dreamer_urlb.evaluation.style import COLORS, frames_label, new_figure
 
 MEASURES = ("whole", "last quarter", "end, actor", "end, Dyna-MPC")
@@ -47,15 +47,21 @@ def scores() -> Scores:
     def add(task: str, arm: str, measure: str, value: float) -> None:
         found.setdefault(task, {}).setdefault(arm, {name: [] for name in MEASURES})[measure].append(value)
 
-    for name, episodes in evidence.curves().items():
+    for name, episodes in study.curves().items():
         task, arm, _ = name.split("/")
-        if not task.startswith("pretraining"):
+        if "pretraining" not in task:
             returns = [value for _, value in sorted(episodes)]
             add(task, arm, "whole", float(np.mean(returns)))
             add(task, arm, "last quarter", float(np.mean(returns[-max(len(returns) // 4, 1) :])))
-    for row in read_rows(evidence.ROOT / "rows.csv", tasks=("finger-spin",)).rows:
-        add(row.task, row.further["arm"], f"end, {'actor' if row.planner == 'none' else 'Dyna-MPC'}", row.return_mean)
+    for row in read_rows(study.ROOT / "rows.csv", tasks=("finger-spin",)).rows:
+        add(task_of(row), row.further["arm"], f"end, {'actor' if row.planner == 'none' else 'Dyna-MPC'}", row.return_mean)
     return found
+
+
+def task_of(row: Row) -> str:
+    """As runs are named: a task, after the name of the setting unless that is states."""
+    sizes = {(setting.observation, setting.preset): size for size, setting in study.SETTINGS.items()}
+    return study.prefix(sizes.get((row.further.get("observation", ""), row.preset), "state")) + row.task
 
 
 def seeds_needed(one: Sequence[float], other: Sequence[float]) -> int:
@@ -102,7 +108,7 @@ def draw(path: Path) -> None:
     """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task."""
     import matplotlib.pyplot as plt
 
-    episodes = evidence.curves()
+    episodes = study.curves()
     tasks = list(scores())
     figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 2.6)
     for axes, task in zip(panels, tasks, strict=True):
@@ -113,11 +119,11 @@ def draw(path: Path) -> None:
             length = min(map(len, runs))
             points = [iqm({task: [run[at] for run in runs]}, FIGURE_REPETITIONS) for at in range(length)]
             middle, low, high = np.array([(point.value, point.low, point.high) for point in points]).T
-            frames = evidence.REPEAT * 500 * np.arange(1, length + 1)
+            frames = study.REPEAT * study.EPISODE * np.arange(1, length + 1)
             axes.plot(frames, middle, color=COLORS[i], label=f"{label} ({len(runs)})")
             axes.fill_between(frames, low, high, color=COLORS[i], alpha=0.2, lw=0)
         axes.set(
-            title=f"{evidence.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None)
+            title=f"{study.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None)
         )
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
         axes.legend(loc="upper left", title="agent (seeds)", title_fontsize=7)

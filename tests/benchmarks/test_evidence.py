@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import dataclasses
 import importlib
 import random
 
@@ -14,34 +14,54 @@ from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 
 
+COLUMNS = (
+    "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset,return_mean,return_std,"
+    "episodes,seconds"
+)
+ROW = "dreamer,walker,run,0,0,1000,,,dyna_mpc,tiny,42.0,0,1,1"
+
+
 @pytest.fixture
-def evidence(monkeypatch, tmp_path):
-    """The script at the size of an episode a run, in a folder of its own."""
+def study(monkeypatch, tmp_path):
+    """The campaign at the size of an episode a run, in a folder of its own."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    script = importlib.import_module("evidence")
-    small = {"ROOT": tmp_path / "evidence", "PRESET": "tiny", "PRETRAINING": 500, "FINETUNING": 500, "EPISODES": 1}
-    for name, value in {**small, "STUDY": ((("lbs-kept", "scratch"), ("run",), 1),)}.items():
+    script = importlib.import_module("evidence_study")
+    sizes = {"pretraining": 500, "finetuning": 500, "device": "cpu"}
+    settings = {
+        name: dataclasses.replace(setting, **sizes, preset="paper" if name == "paper" else "tiny")
+        for name, setting in script.SETTINGS.items()
+    }
+    tiers = ((("lbs-kept", "scratch"), ("run",), 1),)
+    for name, value in {"ROOT": tmp_path / "evidence", "SETTINGS": settings, "STUDY": dict.fromkeys(settings, tiers)}.items():
         monkeypatch.setattr(script, name, value)
     return script
 
 
 @pytest.fixture
-def results(evidence):
+def evidence(monkeypatch, study):
+    """The script that does it."""
+    script = importlib.import_module("evidence")
+    monkeypatch.setattr(script, "EPISODES", 1)
+    return script
+
+
+@pytest.fixture
+def results(study):
     """What reads the runs."""
     return importlib.import_module("evidence_results")
 
 
-def test_missing_runs_are_done_once(evidence, capsys):
+def test_missing_runs_are_done_once(study, evidence, capsys):
     names = ["pretraining/lbs/0", "run/lbs-kept/0", "run/scratch/0"]
-    assert [run.name for run in evidence.wanted()] == names
+    assert [run.name for run in study.wanted()] == names
     evidence.work(float("inf"), at_most=1)
-    assert list(evidence.curves()) == names[:1]
-    pretrained = DreamerV2.load(evidence.snapshot_of(evidence.Run("lbs", "", 0)), device="cpu")
+    assert list(study.curves()) == names[:1]
+    pretrained = DreamerV2.load(study.snapshot_of(study.Run("lbs", "", 0)), device="cpu")
     assert (pretrained.phase, pretrained.num_timesteps) == ("pretraining", 500)
     evidence.work(float("inf"), None)
     evidence.work(float("inf"), None)  # nothing is left
-    assert list(evidence.curves()) == names and all(len(run) == 1 for run in evidence.curves().values())
-    rows = read_rows(evidence.ROOT / "rows.csv").rows
+    assert list(study.curves()) == names and all(len(run) == 1 for run in study.curves().values())
+    rows = read_rows(study.ROOT / "rows.csv").rows
     assert [(row.further["arm"], row.planner, row.pretrain_frames) for row in rows] == [
         ("lbs-kept", "none", 1000),
         ("lbs-kept", "dyna_mpc", 1000),
@@ -57,30 +77,46 @@ def test_another_process_at_a_run_is_left_alone(evidence, monkeypatch):
         evidence.work(float("inf"), None)  # its fine-tuning waits for the pre-training
 
 
-def write(evidence, returns):
+def test_runs_from_pixels_have_their_own_names_and_no_statistics(study, evidence, tmp_path):
+    names = ["pixels-pretraining/lbs/0", "pixels-run/lbs-kept/0", "pixels-run/scratch/0"]
+    runs = list(study.wanted("pixels"))
+    assert [run.name for run in runs] == names
+    model = evidence.begin(runs[0], tmp_path)
+    assert model.observation_space.shape == (3, 64, 64) and model.get_vec_normalize_env() is None
+    evidence.keep(model, study.snapshot_of(runs[0]))
+    assert [path.name for path in (study.ROOT / "snapshots").iterdir()] == ["pixels-lbs-0.zip"]
+    tuned = evidence.begin(runs[1], tmp_path)
+    assert (tuned.phase, tuned.num_timesteps) == ("finetuning", 0)
+
+
+def test_scores_from_pixels_stand_apart(study, evidence, results):
+    for size in study.SETTINGS:
+        evidence.record(study.Run("scratch", "run", 0, size=size), [(500, 1.0)])
+    (study.ROOT / "rows.csv").write_text(COLUMNS + ",observation,arm\n" + ROW + ",pixels,scratch\n")
+    found = results.scores()
+    assert set(found) == {"run", "pixels-run", "paper-run"}
+    assert [task for task in found if found[task]["scratch"]["end, Dyna-MPC"]] == ["pixels-run"]
+
+
+def write(study, evidence, returns):
     """Made-up finished runs: task → arm → a list of returns a seed."""
-    evidence.ROOT.mkdir(parents=True)
+    study.ROOT.mkdir(parents=True)
     for task, arms in returns.items():
         for arm, runs in arms.items():
             for seed, values in enumerate(runs):
-                evidence.record(evidence.Run(arm, task, seed), [(500 * (i + 1), value) for i, value in enumerate(values)])
+                evidence.record(study.Run(arm, task, seed), [(500 * (i + 1), value) for i, value in enumerate(values)])
 
 
-def test_scores_are_means_of_episodes(evidence, results):
-    write(evidence, {"run": {"scratch": [[1, 2, 3, 6], [5, 5, 5, 1]], "lbs-kept": [[9, 9, 9, 1]]}})
-    (evidence.ROOT / "rows.csv").write_text(",".join(("method", "domain")) + "\n")
-    with open(evidence.ROOT / "rows.csv", "w", newline="") as file:
-        columns = "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset,return_mean"
-        writer = csv.writer(file)
-        writer.writerow([*columns.split(","), "return_std", "episodes", "seconds", "arm"])
-        writer.writerow(["dreamer", "walker", "run", 0, 0, 1000, "", "", "dyna_mpc", "tiny", 42.0, 0, 1, 1, "scratch"])
+def test_scores_are_means_of_episodes(study, evidence, results):
+    write(study, evidence, {"run": {"scratch": [[1, 2, 3, 6], [5, 5, 5, 1]], "lbs-kept": [[9, 9, 9, 1]]}})
+    (study.ROOT / "rows.csv").write_text(f"{COLUMNS},arm\n{ROW},scratch\n")
     found = results.scores()["run"]
     assert found["scratch"]["whole"] == [3, 4] and found["scratch"]["last quarter"] == [6, 1]
     assert found["scratch"]["end, Dyna-MPC"] == [42] and found["scratch"]["end, actor"] == []
     assert found["lbs-kept"]["whole"] == [7]
 
 
-def test_a_table_has_what_is_known_and_no_more(evidence, results):
+def test_a_table_has_what_is_known_and_no_more(results):
     four = {name: [1.0, 2.0, 3.0, 4.0] for name in results.MEASURES}
     lines = results.table({"run": {"scratch": four, "lbs-kept": {name: [5.0] for name in results.MEASURES}}}).splitlines()
     assert len(lines) == 3 and lines[2].startswith("| run | from scratch | 4 | 2 [")
@@ -95,11 +131,8 @@ def test_seeds_needed(results):
     assert results.seeds_needed([5.0, 5.0], [1.0, 1.0]) == 2
 
 
-def test_curves_are_drawn(evidence, results, tmp_path):
-    write(evidence, {"run": {"scratch": [[1, 2, 3], [2, 3, 4]], "lbs-kept": [[5, 6, 7], [6, 7, 8]]}})
-    (evidence.ROOT / "rows.csv").write_text(
-        "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset,return_mean,return_std,"
-        "episodes,seconds\n"
-    )
+def test_curves_are_drawn(study, evidence, results, tmp_path):
+    write(study, evidence, {"run": {"scratch": [[1, 2, 3], [2, 3, 4]], "lbs-kept": [[5, 6, 7], [6, 7, 8]]}})
+    (study.ROOT / "rows.csv").write_text(COLUMNS + "\n")
     results.draw(tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 5000
