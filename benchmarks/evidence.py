@@ -1,7 +1,7 @@
 """Does pre-training pay? All runs that answer it: does what is missing, and scores it.
 
     python benchmarks/evidence.py run --minutes 120      # the next missing runs, one after the other, on one thread
-    python benchmarks/evidence.py run --setting pixels   # the same from pictures, slower; "paper": at the paper's size, on a GPU
+    python benchmarks/evidence.py run --setting pixels   # from pictures, slower; "paper": at the paper's size, on a GPU
     python benchmarks/evidence.py list                   # what there is and what is missing
     python benchmarks/evidence_results.py                # what the finished ones say, with intervals and a figure
 

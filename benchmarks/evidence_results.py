@@ -122,9 +122,7 @@ def draw(path: Path) -> None:
             frames = study.REPEAT * study.EPISODE * np.arange(1, length + 1)
             axes.plot(frames, middle, color=COLORS[i], label=f"{label} ({len(runs)})")
             axes.fill_between(frames, low, high, color=COLORS[i], alpha=0.2, lw=0)
-        axes.set(
-            title=f"{study.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None)
-        )
+        axes.set(title=f"{study.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None))
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
         axes.legend(loc="upper left", title="agent (seeds)", title_fontsize=7)
     panels[0].set_ylabel("return of a training episode")

@@ -13,7 +13,6 @@ from places import ROOT
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 
-
 COLUMNS = (
     "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset,return_mean,return_std,"
     "episodes,seconds"
