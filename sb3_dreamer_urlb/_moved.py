@@ -1,14 +1,15 @@
-"""Modules that lay elsewhere in version 0.1: their old names work until version 0.3, with a DeprecationWarning."""
+"""What lay elsewhere in version 0.1, modules and names: old names work until version 0.3, with a DeprecationWarning."""
 
 from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
 ROOT = "sb3_dreamer_urlb"
 #: old name → new name, both below the package
@@ -48,6 +49,15 @@ MOVED = {
     "videos": "callbacks.videos",
     "world_model.observations": "spaces.observations",
 }
+#: module that is where it was → name that left it → where it is now
+MOVED_NAMES = {
+    "phases": {
+        **dict.fromkeys(("PhaseSwitchCallback", "FineTuneCallback"), "callbacks.phase_switch"),
+        **dict.fromkeys(("SnapshotCallback", "SNAPSHOT_FRAMES"), "callbacks.snapshot"),
+        **dict.fromkeys(("TRANSFER", "transfer"), "dreamer_v2.kept_parts"),
+        **dict.fromkeys(("SPARSE_DOMAINS", "keeps_actor"), "transfer_rule"),
+    },
+}
 
 
 class _OldNames(MetaPathFinder, Loader):
@@ -69,3 +79,21 @@ def keep_old_names() -> None:
     """Let imports of old names succeed; may be called again."""
     if not any(isinstance(finder, _OldNames) for finder in sys.meta_path):
         sys.meta_path.append(_OldNames())
+
+
+def names_that_moved(module: str) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a module that some names have left.
+
+    :param module: of ``MOVED_NAMES``
+    """
+
+    def found(name: str) -> Any:
+        old = f"{ROOT}.{module}"
+        if name not in MOVED_NAMES[module]:
+            raise AttributeError(f"module {old!r} has no attribute {name!r}")
+        new = f"{ROOT}.{MOVED_NAMES[module][name]}"
+        told = f"{old}.{name} is now {new}.{name}; the old name ends with version 0.3."
+        warnings.warn(told, DeprecationWarning, stacklevel=2)
+        return getattr(import_module(new), name)
+
+    return found

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
+
+from sb3_dreamer_urlb._moved import names_that_moved
 
 
 @dataclass(frozen=True)
@@ -53,18 +53,5 @@ def phase_ent_coef(phase: str, intrinsic: Any, chosen: float | None, preset: flo
     return default if preset is None else preset
 
 
-def __getattr__(name: str) -> Any:
-    # Until version 0.3: these lay here in version 0.1.
-    moved = {
-        **dict.fromkeys(("PhaseSwitchCallback", "FineTuneCallback"), "callbacks.phase_switch"),
-        **dict.fromkeys(("SnapshotCallback", "SNAPSHOT_FRAMES"), "callbacks.snapshot"),
-        **dict.fromkeys(("TRANSFER", "transfer"), "dreamer_v2.kept_parts"),
-        **dict.fromkeys(("SPARSE_DOMAINS", "keeps_actor"), "transfer_rule"),
-    }
-    if name not in moved:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    new = f"sb3_dreamer_urlb.{moved[name]}"
-    warnings.warn(
-        f"{__name__}.{name} is now {new}.{name}; the old name ends with version 0.3.", DeprecationWarning, stacklevel=2
-    )
-    return getattr(import_module(new), name)
+# Until version 0.3.
+__getattr__ = names_that_moved("phases")

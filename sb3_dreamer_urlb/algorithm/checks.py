@@ -15,7 +15,7 @@ from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 #: arguments of every replay that the algorithm fills in itself
 REPLAY_ARGUMENTS_OF_THE_MODEL = {

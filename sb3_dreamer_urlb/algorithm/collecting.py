@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.algorithm import standing
+from sb3_dreamer_urlb.algorithm import left_environments
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
@@ -215,11 +215,11 @@ class CollectingAlgorithm(SavingAlgorithm):
 
     def _leave_standing(self) -> None:
         assert self.env is not None and self._last_episode_starts is not None
-        standing.leave(self.env, self._touches, self._last_obs, self._last_episode_starts)
+        left_environments.leave(self.env, self._touches, self._last_obs, self._last_episode_starts)
 
     def go_on_where_left(self) -> None:
         """Begin without a reset, if a model left the environments where they stand now."""
-        if self.env is not None and (left := standing.found(self.env)) is not None:
+        if self.env is not None and (left := left_environments.found(self.env)) is not None:
             self._touches, self._last_obs, self._last_episode_starts = left.touches, left.observation, left.starts
 
     def _keeps_what_was_seen(self) -> bool:

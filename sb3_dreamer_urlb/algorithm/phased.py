@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases, transfer_rule
 from sb3_dreamer_urlb.algorithm import checks, normalized, training_loop
-from sb3_dreamer_urlb.algorithm.assigning import AssignableArguments
+from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_dreamer_urlb.algorithm.checks import check_load_keywords
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.runs import run_folder
-from sb3_dreamer_urlb.runs.contract import RunningAlgorithm
+from sb3_dreamer_urlb.runs.running_algorithm import RunningAlgorithm
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target

@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 from sb3_dreamer_urlb.spaces.actions import make_actions
 
 # smallest allowed value of each integer argument
@@ -61,7 +61,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "precision",
     "compile",
 }
-#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assigning.AssignableArguments.assignable`
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assignable_arguments.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {
         "learning_rate", "actor_learning_rate", "critic_learning_rate", "adam_eps", "max_grad_norm", "weight_decay",

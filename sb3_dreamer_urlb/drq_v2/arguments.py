@@ -12,7 +12,7 @@ from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 # smallest allowed value of each integer argument
 INTEGERS = {"buffer_size": 1, "learning_starts": 0, "batch_size": 1, "n_steps": 1}
@@ -30,7 +30,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
 
 #: arguments of the replay that it fills in, too
 REPLAY_ARGUMENTS_OF_THE_MODEL = {"frame_stack", "n_steps", "gamma", "sampling"}
-#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assigning.AssignableArguments.assignable`
+#: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assignable_arguments.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {
         "learning_rate", "adam_eps", "batch_size", "tau", "gamma", "noise_std", "noise_clip",

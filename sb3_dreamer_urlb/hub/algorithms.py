@@ -31,7 +31,7 @@ class SharedAlgorithm:
         return self.kind.__name__
 
 
-ALGORITHMS = (
+SHARED = (
     SharedAlgorithm(DreamerV2, "dreamerv2", "dreamer-v2", "A world model with an actor"),
     SharedAlgorithm(DrQv2, "drq_v2", "drq-v2", "An actor and a critic on encoded frames"),
 )
@@ -42,8 +42,8 @@ def algorithm_of(model: Any) -> SharedAlgorithm:
     :param model: what is to be shared
     :raises ValueError: for anything but a model of one of these algorithms
     """
-    found = next((one for one in ALGORITHMS if isinstance(model, one.kind)), None)
+    found = next((one for one in SHARED if isinstance(model, one.kind)), None)
     if found is None:
-        names = " or ".join(one.name for one in ALGORITHMS)
+        names = " or ".join(one.name for one in SHARED)
         raise ValueError(f"A model of {names} can be shared, got {type(model).__name__}.")
     return found

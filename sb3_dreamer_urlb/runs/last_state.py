@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sb3_dreamer_urlb.runs.contract import RunningAlgorithm
+from sb3_dreamer_urlb.runs.running_algorithm import RunningAlgorithm
 
 
 def save_last_good_state(model: RunningAlgorithm) -> str:

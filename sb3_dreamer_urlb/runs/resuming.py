@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_dreamer_urlb.runs import run_folder
-from sb3_dreamer_urlb.runs.contract import RunningAlgorithm
+from sb3_dreamer_urlb.runs.running_algorithm import RunningAlgorithm
 from sb3_dreamer_urlb.snapshots.model_data import describe_arguments
 from sb3_dreamer_urlb.snapshots.values import contains_custom, decode
 

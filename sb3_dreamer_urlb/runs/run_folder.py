@@ -28,7 +28,7 @@ from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
 from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming, reading
 from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 

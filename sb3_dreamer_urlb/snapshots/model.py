@@ -16,9 +16,9 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
 from sb3_dreamer_urlb.snapshots.random_state import RandomStates
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 

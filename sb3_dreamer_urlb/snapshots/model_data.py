@@ -15,8 +15,8 @@ from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
 from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
 from sb3_dreamer_urlb.snapshots.random_state import capture
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 

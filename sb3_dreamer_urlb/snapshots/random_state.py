@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 
 def generator_state(generator: np.random.Generator) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 
 class RunningAlgorithm(SavedAlgorithm):

@@ -6,7 +6,7 @@ import functools
 from typing import Any, ClassVar
 
 from sb3_dreamer_urlb.number_checks import plain
-from sb3_dreamer_urlb.snapshots.contract import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 
 class AssignableArguments(SavedAlgorithm):
