@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.envs.told import FACTS, STEPS, TOLD, Asked, Foreign, as_received, fewest_steps, shown, tell
+from sb3_dreamer_urlb.envs.visiting import visited
 from sb3_dreamer_urlb.number_checks import plain
 
 
@@ -56,7 +57,7 @@ def _told(env: VecEnv, name: str) -> Any:
     innermost = env.unwrapped
     if isinstance(innermost, DummyVecEnv):
         return tell(innermost.envs[0])[name]
-    if isinstance(innermost, SubprocVecEnv | SupervisedVecEnv) and innermost.env_is_wrapped(Asked, indices=0)[0]:  # type: ignore[arg-type]
+    if isinstance(innermost, SubprocVecEnv | SupervisedVecEnv) and visited(innermost, Asked, indices=0):
         return as_received(innermost.get_attr(TOLD, indices=0)[0][name])
     # One without a wrapper cannot be asked so, and others' VecEnvs may know of no wrappers.
     if name != STEPS:

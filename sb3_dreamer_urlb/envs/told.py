@@ -1,8 +1,7 @@
 """What one environment tells about itself, read where it lives, and sent from there only if it can be sent.
 
 An environment in another process may have attributes that no pickle can hold (a lock, a function in its spec), or properties
-that raise. Asked for one of these, a worker of SB3's ``SubprocVecEnv`` ends. So it is asked with a class instead, whether it
-is wrapped in it: the question reaches the environment in its process, and no worker ends by it.
+that raise. Asked for one of these, a worker of SB3's ``SubprocVecEnv`` ends. So a visitor asks in its stead.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from sb3_dreamer_urlb.envs.visiting import Visitor
 from sb3_dreamer_urlb.number_checks import is_integer, plain
 
 
@@ -89,14 +89,13 @@ def fewest_steps(told: dict[str, Any], of_wrappers: Sequence[Any] = ()) -> int |
     return min((int(count) for count in map(plain, counts) if is_count(count)), default=None)
 
 
-class _Asking(type):
-    def __instancecheck__(cls, env: Any) -> bool:
+class Asked(metaclass=Visitor):
+    """An environment that was visited has told all, under the name ``TOLD``."""
+
+    @staticmethod
+    def visit(env: gymnasium.Env[Any, Any]) -> None:
+        """Let it tell."""
         vars(env)[TOLD] = {name: _as_sent(name, value) for name, value in tell(env).items()}
-        return True
-
-
-class Asked(metaclass=_Asking):
-    """What every wrapper is an instance of, once it is asked: it has then told all, under the name ``TOLD``."""
 
 
 def _as_sent(name: str, value: Any) -> Any:

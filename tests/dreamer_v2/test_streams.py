@@ -16,10 +16,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.envs import worker
+from sb3_dreamer_urlb.envs import SupervisedVecEnv, worker
 from sb3_dreamer_urlb.envs.faults import FaultGuard
 from sb3_dreamer_urlb.envs.touches import last_touches
 
@@ -348,6 +348,74 @@ def test_touches_are_told_apart():
         before = last_touches(env)
         touch()
         assert last_touches(env) != before
+
+
+class WarmedUp(TellingEnv):
+    def warm_up(self):
+        self.reset()
+
+    def score(self):
+        return self.frames
+
+
+#: VecEnvs of processes, and whether each is asked inside
+PROCESSES = {
+    "SubprocVecEnv": (lambda fns: SubprocVecEnv(fns, start_method="forkserver"), True),
+    "SupervisedVecEnv": (SupervisedVecEnv, True),
+    "unwrapped": (lambda fns: SubprocVecEnv(fns, start_method="forkserver"), False),
+}
+
+
+@pytest.mark.parametrize("way", PROCESSES)
+def test_touches_in_other_processes_are_noticed_and_nothing_else(way):
+    make, wrapped = PROCESSES[way]
+    env = make([lambda: Monitor(WarmedUp()) if wrapped else WarmedUp()] * 2)
+    try:
+        env.reset()
+        last_touches(env)
+        touches = {
+            "env_method": lambda: env.env_method("reset"),
+            "of the second": lambda: env.env_method(method_name="reset", indices=[1]),
+            "reset": env.reset,
+            "evaluation's": VecNormalize(env, norm_obs=False).reset,
+        }
+        if wrapped:
+            touches["within a method"] = lambda: env.env_method("warm_up", indices=1)
+        for name, touch in touches.items():
+            before = last_touches(env)
+            touch()
+            assert last_touches(env) != before, name
+        before = last_touches(env)
+        env.env_method("score"), env.get_attr("frames"), env.set_attr("color", 1), env.env_is_wrapped(Monitor)
+        assert last_touches(env) == before
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("way", ["SubprocVecEnv", "SupervisedVecEnv"])
+def test_rows_from_other_processes_followed_each_other(tiny_model, way):
+    """One array and one info, reused, and a method that resets between two calls of learn."""
+    env = PROCESSES[way][0]([lambda: Monitor(WarmedUp(reused=True, terminates=True))] * 2)
+    try:
+        model = tiny_model(env, replay_buffer_kwargs={"sampling": "rows"})
+        for method in ("score", "warm_up", "score"):
+            model.learn(18, reset_num_timesteps=False)
+            env.env_method(method)
+        told = env.get_attr("told")
+        for episode in model.replay_buffer.episodes:
+            frames = counter(episode.observation).tolist()
+            assert frames == list(range(frames[0], frames[-1] + 1))
+            assert any(
+                its[frames[0]] is None
+                and all(step is not None for step in its[frames[0] + 1 : frames[-1] + 1])
+                and its[frames[-1]][1:] == (episode.reward[-1], episode.is_terminal[-1])
+                for its in told
+                if len(its) > frames[-1]
+            )
+        ends = [step for its in told for step in its if step is not None and step[2]]
+        assert sum(bool(episode.is_terminal[-1]) for episode in model.replay_buffer.episodes) == len(ends) > 0
+    finally:
+        env.close()
 
 
 def test_watched_environments_are_copied_and_pickled_as_ever():
