@@ -1,8 +1,8 @@
 """Calling something with an environment where it lives, in another process, too.
 
-A worker of Stable-Baselines3's ``SubprocVecEnv`` does what is on its list, and ends by any error. One thing on it takes a class:
-whether the environment is wrapped in it. A class that is asked for its instances can answer with what it likes, so it gets to
-see the environment in its own process. Only wrappers are asked: environments without any cannot be visited.
+A worker of Stable-Baselines3's ``SubprocVecEnv`` does what is on its list, and ends by any error. One thing on it takes a
+class: whether the environment is wrapped in it. A class that is asked for its instances can answer with what it likes, so it
+gets to see the environment in its own process. Only wrappers are asked: environments without any cannot be visited.
 """
 
 from __future__ import annotations
