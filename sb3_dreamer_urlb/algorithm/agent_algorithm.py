@@ -15,6 +15,7 @@ from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
 from sb3_dreamer_urlb.learning import graphs
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
+from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.types import MetricMeans
 
 
@@ -30,7 +31,7 @@ class AgentAlgorithm(PhasedAlgorithm):
     #: how updates run, one of ``graphs.COMPILE``
     compile: str
     learner: BaseLearner[Any, Any]
-    #: what the agents in the environments remember; None at their very beginning
+    #: what the agents in the environments remember; None at their very beginning, which may be in the middle of episodes
     _acting_state: Memory | None = None
 
     # -- set-up --------------------------------------------------------------------------------------------------------
@@ -95,6 +96,11 @@ class AgentAlgorithm(PhasedAlgorithm):
         learner: BaseLearner[Any, Any] | None = getattr(self, "learner", None)
         return None if learner is None else learner.guard
 
+    def load_replay_buffer(self, path: Target, truncate_last_traj: bool = True) -> None:
+        super().load_replay_buffer(path, truncate_last_traj)
+        # Its next row begins an episode.
+        self._acting_state = None
+
     # -- acting --------------------------------------------------------------------------------------------------------
 
     def _prepare_policy(self) -> None:
@@ -117,10 +123,13 @@ class AgentAlgorithm(PhasedAlgorithm):
         """One step of the agent with its memory; what it remembers is the action *as executed*."""
         assert self._last_obs is not None and self._last_episode_starts is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        state: Memory = self._acting_state or self.policy.initial_state(n_envs)
+        state, starts = self._acting_state, self._last_episode_starts
+        if state is None:
+            # As in the replay, where an episode begins with whatever comes first.
+            state, starts = self.policy.initial_state(n_envs), np.ones(n_envs, bool)
         self._prepare_policy()
         with th.no_grad():
-            state = self.policy.observe(observation, state, th.as_tensor(self._last_episode_starts, device=self.device))
+            state = self.policy.observe(observation, state, th.as_tensor(starts, device=self.device))
             actions = self._random_actions(learning_starts, n_envs)
             if actions is None:
                 state = self.policy.choose(state, deterministic=False)

@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_dreamer_urlb.drq_v2.agent import DrQAgent
 from sb3_dreamer_urlb.intrinsic import EncodedSteps
+from sb3_dreamer_urlb.intrinsic.method import check_reward
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
 from sb3_dreamer_urlb.types import Metrics, StepBatch
@@ -40,7 +41,8 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
     """Trains an agent: intrinsic reward, encoder, critic, actor.
 
     The encoder learns from the critic's loss on a task. While pre-training, a method whose loss trains the encoder takes it
-    over; actor and critic then learn on its encodings as they are.
+    over; actor and critic then learn on its encodings as they are. In an update in which that loss does not reach the encoder,
+    or there is none, the critic's trains it.
 
     :param agent: the networks
     :param config: the numbers
@@ -53,16 +55,17 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
         self.noise_std = th.zeros((), device=self.device)
         intrinsic = agent.intrinsic
         encoder = [] if config.freeze_encoder else list(agent.encoder.parameters())
-        taken_over = intrinsic is not None and intrinsic.trains_encoder
-        #: whether the critic's loss trains the encoder
-        self.critic_trains_encoder = bool(encoder) and not taken_over
+        self._encoder = encoder
+        #: whether the intrinsic reward's loss may train the encoder
+        self.taken_over = intrinsic is not None and intrinsic.takes_encoder_over()
         self.actor_optimizer = self._optimizer(agent.actor.parameters())
-        self.critic_optimizer = self._optimizer([*agent.critic.parameters(), *(() if taken_over else encoder)])
+        self.critic_optimizer = self._optimizer([*agent.critic.parameters(), *(() if self.taken_over else encoder)])
         self.intrinsic_optimizer: ClippedAdam | None = None
         if intrinsic is not None:
             trained = [parameter for parameter in intrinsic.parameters() if parameter.requires_grad]
+            trained += encoder if self.taken_over else []
             if trained:
-                self.intrinsic_optimizer = self._optimizer([*trained, *(encoder if taken_over else ())])
+                self.intrinsic_optimizer = self._optimizer(trained)
         self._get_ready([] if intrinsic is None else [intrinsic], intrinsic)
 
     def _optimizer(self, parameters: Iterable[nn.Parameter]) -> ClippedAdam:
@@ -94,8 +97,7 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
                 next_encoding = agent.encode(batch.next_observation, augment=True)
         steps = EncodedSteps(encoding, batch.action, next_encoding)
         reward, metrics = self._reward(steps, batch.reward)
-        seen = encoding if self.critic_trains_encoder else encoding.detach()
-        metrics.update(self._update_critic(seen, next_encoding, reward, batch))
+        metrics.update(self._update_critic(encoding, next_encoding, reward, batch))
         metrics.update(self._update_actor(encoding.detach()))
         polyak_update(agent.critic.parameters(), agent.target_critic.parameters(), config.tau)
         return {**metrics, "reward": reward.mean(), "task_reward": batch.reward.mean()}
@@ -106,24 +108,32 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
         if intrinsic is None:
             return task_reward, {}
         detached = EncodedSteps(steps.encoding.detach(), steps.action, steps.next_encoding)
+        if self.intrinsic_optimizer is not None:
+            self.intrinsic_optimizer.reached = []
         with self._products():
-            learnt = intrinsic.loss(steps if intrinsic.trains_encoder else detached)
-        metrics = self._step_intrinsic(learnt, self.intrinsic_optimizer)
+            learnt = intrinsic.loss(steps if self.taken_over else detached)
+        metrics = self._step_intrinsic(intrinsic, learnt, self.intrinsic_optimizer)
         with th.no_grad(), self._products():
             reward = intrinsic.reward(detached)
+        check_reward(intrinsic, "reward", reward, task_reward.shape, "(B,)")
         metrics["intrinsic_reward"] = reward.mean()
         return reward, metrics
 
     def _update_critic(self, encoding: th.Tensor, next_encoding: th.Tensor, reward: th.Tensor, batch: StepBatch) -> Metrics:
-        """Both critics towards r + γ^n · min Q̄(s', a'), a' the actor's with clipped noise."""
+        """Both critics towards r + γ^n · min Q̄(s', a'), a' the actor's with clipped noise; and the encoder, if it is left."""
         agent = self.agent
+        left = self._encoder_is_left()
         with th.no_grad(), self._products():
             next_action = agent.actor(next_encoding, self.noise_std).sample(noise_clip=self.config.noise_clip)
             next_value = agent.target_critic(next_encoding, next_action).amin(-1)
             target = reward + batch.discount * next_value
         with self._products():
-            values = agent.critic(encoding, batch.action)
+            values = agent.critic(encoding if left else encoding.detach(), batch.action)
         loss = (values - target.unsqueeze(-1)).square().mean(0).sum()
+        if left and self.taken_over:
+            # It stays in the optimiser where it was put: whether a method's loss reaches it is known now only.
+            assert self.intrinsic_optimizer is not None
+            self.intrinsic_optimizer.step(loss, partly=True, again=True)
         norm = self.critic_optimizer.step(loss)
         return {
             "critic_loss": loss.detach(),
@@ -131,6 +141,13 @@ class DrQLearner(BaseLearner[DrQAgent, StepBatch]):
             "critic": values.detach().mean(),
             "critic_target": target.mean(),
         }
+
+    def _encoder_is_left(self) -> bool:
+        """Whether the encoder has not learnt in this update, and is to."""
+        if not self.taken_over or not self._encoder:
+            return bool(self._encoder)
+        assert self.intrinsic_optimizer is not None
+        return not any(parameter is self._encoder[0] for parameter in self.intrinsic_optimizer.reached)
 
     def _update_actor(self, encoding: th.Tensor) -> Metrics:
         """Up the smaller value of its own actions; the encoder learns nothing from that."""

@@ -89,6 +89,8 @@ def make_intrinsic_reward(
 
 
 def _checked(made: Method) -> Method:
+    if "_parameters" not in vars(made):
+        raise ValueError(f"{type(made).__qualname__}.__init__ must call super().__init__() before anything else.")
     if isinstance(made, IntrinsicReward) and made.skills is not None and not isinstance(made, SkillReward):
         raise ValueError(f"{type(made).__qualname__} has skills, so it must be a subclass of SkillReward, which chooses one.")
     return made

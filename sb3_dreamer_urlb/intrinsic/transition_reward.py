@@ -52,8 +52,12 @@ class TransitionReward(ExplorationMethod, ABC):
     def __init__(self) -> None:
         super().__init__()
         #: True: the gradient of :meth:`loss` trains the encoder, on whose encodings, detached, actor and critic learn.
-        #: False: the encoder learns from the critic's loss, as on a task
+        #: False, or without a :meth:`loss` that reaches it: the encoder learns from the critic's loss, as on a task
         self.trains_encoder = True
+
+    def takes_encoder_over(self) -> bool:
+        """Whether :meth:`loss` may train the encoder in place of the critic's."""
+        return self.trains_encoder and type(self).loss is not TransitionReward.loss
 
     def build(self, sizes: EncoderSizes) -> None:
         """Make the networks. Called once, on a copy of what the user handed in.
@@ -63,6 +67,8 @@ class TransitionReward(ExplorationMethod, ABC):
 
     def loss(self, steps: EncodedSteps) -> tuple[th.Tensor, Metrics] | None:
         """What the networks learn from a batch; None if there is nothing to learn.
+
+        Where it depends on ``steps.encoding``, its gradient trains the encoder, also without networks of its own.
 
         :param steps: their ``encoding`` carries a gradient if ``trains_encoder``
         :return: loss (scalar) and metrics (detached scalars, logged as ``train/intrinsic_<name>``)

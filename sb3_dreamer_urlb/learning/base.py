@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_dreamer_urlb import native
+from sb3_dreamer_urlb.intrinsic.method import check_learnt
 from sb3_dreamer_urlb.learning.graphs import Recorder, make_backend, memory_of
 from sb3_dreamer_urlb.learning.memory import keep_freed_memory
 from sb3_dreamer_urlb.learning.numerical_faults import UpdateGuard
@@ -125,18 +126,26 @@ class BaseLearner(Generic[AnyAgent, Batch]):
             yield from optimizer.memory()
 
     @staticmethod
-    def _step_intrinsic(learnt: tuple[th.Tensor, Metrics] | None, optimizer: ClippedAdam | None) -> Metrics:
+    def _step_intrinsic(
+        method: nn.Module, learnt: tuple[th.Tensor, Metrics] | None, optimizer: ClippedAdam | None
+    ) -> Metrics:
         """What an intrinsic reward's networks learn; nothing where there is nothing to learn.
 
+        :param method: the intrinsic reward
         :param learnt: its loss and metrics
-        :param optimizer: its own
+        :param optimizer: its own; None if there is nothing to train
+        :raises ValueError: for what is no loss
         """
-        if learnt is None or optimizer is None:
+        check_learnt(method, learnt)
+        if learnt is None:
             return {}
         loss, metrics = learnt
         metrics = {f"intrinsic_{name}": value.detach() for name, value in metrics.items()}
-        metrics["intrinsic_grad_norm"] = optimizer.step(loss)
         metrics["intrinsic_loss"] = loss.detach()
+        if optimizer is not None:
+            if not loss.requires_grad:
+                raise ValueError(f"{type(method).__qualname__}.loss depends on nothing that it could train.")
+            metrics["intrinsic_grad_norm"] = optimizer.step(loss, partly=True)
         return metrics
 
     def _update(self, batch: Any, generator: th.Generator | None = None, *situation: Hashable) -> Metrics:

@@ -14,6 +14,7 @@ from sb3_dreamer_urlb.behavior import actor_critic
 from sb3_dreamer_urlb.behavior.actor_critic import DYNAMICS
 from sb3_dreamer_urlb.behavior.returns import lambda_return
 from sb3_dreamer_urlb.intrinsic.base import RewardSource
+from sb3_dreamer_urlb.intrinsic.method import check_reward
 from sb3_dreamer_urlb.learning.base import BaseLearner
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
 from sb3_dreamer_urlb.nn import distributions
@@ -122,12 +123,13 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
     def _update_intrinsic(self, posterior: Posterior, batch: SequenceBatch) -> Metrics:
         with self._products():
             learnt = self.reward_source.loss(posterior, batch)
-        return self._step_intrinsic(learnt, self.intrinsic_optimizer)
+        return self._step_intrinsic(self.reward_source, learnt, self.intrinsic_optimizer)
 
     def _update_world_model(self, posterior: Posterior, observation: Observation, batch: SequenceBatch) -> Metrics:
         config = self.config
         with self._products():
             reward = self.reward_source.replay_reward(_detached(posterior), batch)
+            check_reward(self.reward_source, "replay_reward", reward, batch.reward.shape, "(B, T)")
             loss, metrics = self.agent.world_model.loss(
                 posterior,
                 observation,
@@ -171,6 +173,7 @@ class Learner(BaseLearner[Agent, SequenceBatch]):
         with _frozen(agent.world_model, agent.slow_critic, agent.intrinsic), self._products():
             imagination, log_prob = self._imagine(start, skill)
             raw_reward = self.reward_source.reward(imagination, agent.world_model.reward)
+            check_reward(self.reward_source, "reward", raw_reward, imagination.seen.shape[:-1], "(H + 1, N)")
             reward = agent.reward_normalizer(raw_reward)
             discount = agent.world_model.discount(imagination.seen, goes_on)
             value = agent.slow_critic(imagination.seen, skill)

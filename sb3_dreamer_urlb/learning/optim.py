@@ -30,8 +30,10 @@ class ClippedAdam:
         self.eps = eps
         self.max_grad_norm = max_grad_norm
         self.weight_decay = weight_decay
-        #: whether the last step was skipped, bool scalar on the device; whoever wants to know sets it to None before
+        #: whether a step was skipped, bool scalar on the device, since whoever wants to know set it to None
         self.skipped: th.Tensor | None = None
+        #: the parameters that the last step's loss depended on
+        self.reached: list[nn.Parameter] = []
         self._capturable = device.type == "cuda"
         self.adam = th.optim.Adam(self.parameters, lr=self._rate, eps=eps, fused=True, capturable=self._capturable)
         # torch would warn that a capturable optimiser is wasted on steps outside of a graph, which the first ones are.
@@ -43,26 +45,30 @@ class ClippedAdam:
             self.learning_rate = learning_rate
             self._rate.fill_(learning_rate)
 
-    def step(self, loss: th.Tensor) -> th.Tensor:
+    def step(self, loss: th.Tensor, partly: bool = False, again: bool = False) -> th.Tensor:
         """Descend ``loss``; other parameters in its graph receive no gradient.
 
         A loss or gradient that is not finite changes nothing, neither weights nor moments. That is decided on the device.
 
         :param loss: scalar
+        :param partly: it may depend on some of the parameters only; the others, and their moments, stay as they are
+        :param again: keep its graph, for another optimiser's step on it
         :return: the gradient's global norm before the bound, a detached scalar
         """
-        grads = th.autograd.grad(loss, self.parameters)
+        grads = th.autograd.grad(loss, self.parameters, retain_graph=again, allow_unused=partly)
         for parameter, grad in zip(self.parameters, grads, strict=True):
             # Fused Adam reads raw memory: a gradient laid out channels-last would be applied to the wrong weights.
-            parameter.grad = grad.contiguous()
+            parameter.grad = None if grad is None else grad.contiguous()
+        self.reached = [parameter for parameter in self.parameters if parameter.grad is not None]
         norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        self.skipped = ~(norm.isfinite() & loss.detach().isfinite())
-        self._shrink(~self.skipped & (self._rate > 0))
+        skips = ~(norm.isfinite() & loss.detach().isfinite())
+        self.skipped = skips if self.skipped is None else self.skipped | skips
+        self._shrink(~skips & (self._rate > 0))
         for group in self.adam.param_groups:
             # Whoever loads Adam's state replaces its settings, too.
             group.update(lr=self._rate, eps=self.eps, weight_decay=0.0, capturable=self._capturable)
         # What torch's gradient scaler tells fused Adam by.
-        self.adam.found_inf = self.skipped.float()  # type: ignore[attr-defined]
+        self.adam.found_inf = skips.float()  # type: ignore[attr-defined]
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
         return norm
@@ -70,7 +76,7 @@ class ClippedAdam:
     @th.no_grad()
     def _shrink(self, steps: th.Tensor) -> None:
         """The weight decay, where ``steps``, a bool scalar on the device, is true."""
-        th._foreach_mul_(tuple(self.parameters), 1 - self.weight_decay * steps.to(self._rate.dtype))
+        th._foreach_mul_(tuple(self.reached), 1 - self.weight_decay * steps.to(self._rate.dtype))
 
     def memory(self) -> Iterator[th.Tensor]:
         """All that a step reads and writes besides the parameters and the loss: moments and the step size."""

@@ -136,6 +136,29 @@ def test_it_acts_on_the_stacks_that_it_learns_from(n_envs):
     assert all(later - earlier in (0, 1) for stack in drawn for earlier, later in pairwise(stack))
 
 
+@pytest.mark.parametrize("how", ["loaded", "its own", "a replay of before"])
+def test_its_stacks_are_the_replays_where_it_goes_on_in_the_middle_of_an_episode(tmp_path, how):
+    env = vec_env(2, 50)
+    model = tiny(env, frame_stack=3).learn(42)
+    if how == "loaded":
+        model.save(tmp_path / "model")
+        model = DrQv2.load(tmp_path / "model", env=env, device="cpu", force_reset=False)
+    elif how == "a replay of before":
+        model.save_replay_buffer(tmp_path / "replay")
+        model.load_replay_buffer(tmp_path / "replay")
+    acted = []
+    model.learn(
+        10,
+        lambda *_: acted.extend(tuple(counter(stack)) for stack in model._acting_state.frames.numpy()) or True,
+        reset_num_timesteps=False,
+    )
+    model.replay_buffer.close_streams()
+    drawn = {tuple(counter(stack)) for stack in model.replay_buffer.sample(2000).observation.numpy()}
+    assert acted and set(acted) <= drawn
+    # None was reset for it.
+    assert {env.get_attr("resets")[i] for i in range(2)} == {1}
+
+
 def test_predict_hands_the_frames_on():
     model = tiny(frame_stack=3)
     frames = [np.full((16, 16, 3), value, np.uint8) for value in (10, 20, 30, 40)]
@@ -310,6 +333,115 @@ def test_a_method_from_outside(monkeypatch, tmp_path, method):
         assert DrQv2.load(tmp_path / "model", device="cpu").policy.agent.intrinsic.value == 2.0
     finally:
         del _REGISTRY["constant"]
+
+
+class Own(TransitionReward):
+    """Rewards large encodings; loss and reward are handed in."""
+
+    def __init__(self, loss=None, reward=None, trains_encoder=True):
+        super().__init__()
+        self.trains_encoder = trains_encoder
+        if loss is not None:
+            self.given_loss = loss
+        self.given_reward = reward or (lambda steps: steps.next_encoding.norm(dim=-1))
+
+    def build(self, sizes):
+        self.net = th.nn.Linear(sizes.encoding, 1)
+
+    def reward(self, steps):
+        return self.given_reward(steps)
+
+
+class Learning(Own):
+    def loss(self, steps):
+        return self.given_loss(self, steps)
+
+
+class Bare(Learning):
+    """Without networks of its own."""
+
+    def build(self, sizes):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("method", "who"),
+    [
+        (Own(), "critic"),
+        (Own(trains_encoder=False), "critic"),
+        (Learning(lambda *_: None), "critic"),
+        (Learning(lambda own, steps: (own.net(steps.encoding.detach()).square().mean(), {})), "critic"),
+        (Learning(lambda own, steps: (own.net(steps.encoding).square().mean(), {}), trains_encoder=False), "critic"),
+        (Learning(lambda own, steps: (own.net(steps.encoding).square().mean(), {})), "method"),
+        (Learning(lambda _, steps: (steps.encoding.square().mean(), {})), "method"),
+        (Bare(lambda _, steps: (steps.encoding.square().mean(), {})), "method"),
+        (Bare(lambda *_: None), "critic"),
+    ],
+)
+def test_the_encoder_learns_from_the_method_or_else_from_the_critic(weights, method, who):
+    """Whoever trains it: without the critic's gradient to it, it would stay in the latter cases."""
+    model = tiny(intrinsic_reward=method, learning_starts=4)
+    learner, agent = model.learner, model.policy.agent
+    values_seen = []
+    original = type(agent.critic).forward
+
+    def spy(critic, encoding, action):
+        values_seen.append(encoding.requires_grad)
+        return original(critic, encoding, action)
+
+    before = weights(agent.encoder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(agent.critic), "forward", spy)
+        model.learn(24)
+    assert any(values_seen) == (who == "critic")
+    assert weights(agent.encoder) != before and learner.guard.total() == 0
+
+
+def test_the_critic_trains_an_encoder_that_is_left_to_it_in_the_same_way(weights):
+    """The same steps, whichever optimiser holds the encoder."""
+    found = [
+        weights(tiny(intrinsic_reward=method, learning_starts=4).learn(40).policy.agent.encoder)
+        for method in (Own(trains_encoder=False), Own(), Learning(lambda *_: None))
+    ]
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize(
+    ("reward", "got"),
+    [
+        (lambda steps: steps.action[:, :1], r"float32 of the shape \(4, 1\)"),
+        (lambda steps: steps.action.mean(), r"float32 of the shape \(\)"),
+        (lambda steps: steps.action[:1, 0], r"float32 of the shape \(1,\)"),
+        (lambda steps: steps.action[:, 0].long(), r"int64 of the shape \(4,\)"),
+        (lambda steps: 1.0, "got float"),
+    ],
+)
+def test_a_reward_of_another_shape_is_refused(reward, got):
+    with pytest.raises(ValueError, match=rf"Own.reward must return a float tensor of the shape \(B,\) = \(4,\).*{got}"):
+        tiny(intrinsic_reward=Own(reward=reward)).learn(24)
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        (lambda own, steps: own.net(steps.encoding).mean(), r"must return None, or .*got torch.float32 of the shape \(\)"),
+        (lambda own, steps: (own.net(steps.encoding).mean(0), {}), r"got \(torch.float32 of the shape \(1,\), dict\)"),
+        (lambda own, steps: (own.net(steps.encoding).mean(), {"error": 1.0}), "dictionary of scalar tensors"),
+        (lambda own, steps: (own.net(steps.encoding).mean().detach(), {}), "depends on nothing that it could train"),
+    ],
+)
+def test_what_is_no_loss_is_refused(loss, message):
+    with pytest.raises(ValueError, match=f"Learning.loss .*{message}"):
+        tiny(intrinsic_reward=Learning(loss)).learn(24)
+
+
+def test_a_method_that_forgot_its_base_is_told():
+    class Forgetful(Own):
+        def __init__(self):
+            pass
+
+    with pytest.raises(ValueError, match=r"Forgetful.__init__ must call super\(\).__init__\(\)"):
+        tiny(intrinsic_reward=Forgetful)
 
 
 # -- files and runs --------------------------------------------------------------------------------------------------------

@@ -379,6 +379,28 @@ def test_the_papers_hyperparameters():
     assert set(momenta.values()) == {0.95, 1.0} and DIAYN.ent_coef == 0.1 and APS.ent_coef == 0.0
 
 
+class Misshapen(IntrinsicReward):
+    """Its reward, or the one it labels the replay with, has another shape."""
+
+    def __init__(self, part, shape):
+        super().__init__()
+        self.part, self.shape = part, shape
+
+    def reward(self, imagination, reward_head):
+        return imagination.action.new_zeros(self.shape) if self.part == "reward" else super().reward(imagination, reward_head)
+
+    def replay_reward(self, posterior, batch):
+        return batch.reward.new_zeros(self.shape) if self.part == "replay_reward" else batch.reward
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+@pytest.mark.parametrize(("part", "expected"), [("reward", r"\(H \+ 1, N\)"), ("replay_reward", r"\(B, T\)")])
+def test_a_reward_of_another_shape_is_refused(tiny_model, part, expected, shape):
+    model = tiny_model(intrinsic_reward=Misshapen(part, shape))
+    with pytest.raises(ValueError, match=rf"Misshapen.{part} must return a float tensor of the shape {expected} = .*got"):
+        model.learn(60)
+
+
 def test_skills_belong_to_a_skill_reward(tiny_model):
     class Half(IntrinsicReward):
         def __init__(self):
