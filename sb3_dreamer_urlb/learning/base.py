@@ -126,9 +126,7 @@ class BaseLearner(Generic[AnyAgent, Batch]):
             yield from optimizer.memory()
 
     @staticmethod
-    def _step_intrinsic(
-        method: nn.Module, learnt: tuple[th.Tensor, Metrics] | None, optimizer: ClippedAdam | None
-    ) -> Metrics:
+    def _step_intrinsic(method: nn.Module, learnt: tuple[th.Tensor, Metrics] | None, optimizer: ClippedAdam | None) -> Metrics:
         """What an intrinsic reward's networks learn; nothing where there is nothing to learn.
 
         :param method: the intrinsic reward
