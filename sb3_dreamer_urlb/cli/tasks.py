@@ -41,8 +41,8 @@ class Task(NamedTuple):
 
 def tasks() -> list[Task]:
     """All registered ids but ``urlb/dm_control-v0``, which has any length and any action."""
-    from sb3_dreamer_urlb.envs.perturbations import LEVELS
-    from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, PRIMAL_TASK, RWRL_DOMAINS, URLB_TASKS, env_id
+    from sb3_dreamer_urlb.envs import registration
+    from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, PRIMAL_TASK, URLB_TASKS, env_id
 
     found = []
     for domain, names in URLB_TASKS.items():
@@ -57,10 +57,10 @@ def tasks() -> list[Task]:
         "dense": "sparsity: larger rewarded area",
     }
     for name in JACO_VARIANT_TASKS:
-        found.append(_task(f"urlb/jaco-{name}-v0", "jaco", name, purposes[name.partition("-")[2]]))
-    for domain in RWRL_DOMAINS:
-        for level in LEVELS:
-            found.append(_task(f"rwrl/{domain}-walk-{level}-v0", domain, "walk", f"robustness: perturbed, {level}"))
+        found.append(_task(registration.variant_id(name), "jaco", name, purposes[name.partition("-")[2]]))
+    for domain in URLB_TASKS:
+        for level, its_id in registration.rwrl_ids(domain).items():
+            found.append(_task(its_id, domain, "walk", f"robustness: perturbed, {level}"))
     return found
 
 

@@ -47,11 +47,26 @@ def check_urlb_task(domain: str, task: str) -> None:
         raise ValueError(f"task={task!r}: {domain} has {', '.join(URLB_TASKS[domain])}")
 
 
+def variant_id(task: str) -> str:
+    """The gymnasium id of one of ``JACO_VARIANT_TASKS``.
+
+    :param task: its name
+    """
+    return f"urlb/jaco-{task}-v0"
+
+
+def rwrl_ids(domain: str) -> dict[str, str]:
+    """Level → gymnasium id of the Real-World RL suite's tasks; empty for bodies that it does not perturb here.
+
+    :param domain: any
+    """
+    return {level: f"rwrl/{domain}-walk-{level}-v0" for level in LEVELS} if domain in RWRL_DOMAINS else {}
+
+
 def register_envs() -> None:
     """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, the Jaco tasks' variants,
-    ``rwrl/<domain>-walk-<level>-v0`` of the
-    Real-World RL suite, and ``urlb/dm_control-v0`` for any other
-    task of dm_control (``gymnasium.make("urlb/dm_control-v0", domain="cartpole", task="swingup")``).
+    ``rwrl/<domain>-walk-<level>-v0`` of the Real-World RL suite, and ``urlb/dm_control-v0`` for any other task of dm_control
+    (``gymnasium.make("urlb/dm_control-v0", domain="cartpole", task="swingup")``).
 
     Entry points are strings, so that a spawned process can load them. No ``max_episode_steps``: dm_control truncates, and
     the environment tells its length in its own attribute of that name. May be called again.
@@ -61,10 +76,10 @@ def register_envs() -> None:
             _register(env_id(domain, task), "make_urlb_env", {"domain": domain, "task": task})
     _register("urlb/dm_control-v0", "make_dmc_env", {})
     for task in JACO_VARIANT_TASKS:
-        _register(f"urlb/jaco-{task}-v0", "make_dmc_env", {"domain": "jaco", "task": task})
+        _register(variant_id(task), "make_dmc_env", {"domain": "jaco", "task": task})
     for domain in RWRL_DOMAINS:
-        for level in LEVELS:
-            _register(f"rwrl/{domain}-walk-{level}-v0", "make_rwrl_env", {"domain": domain, "task": "walk", "level": level})
+        for level, name in rwrl_ids(domain).items():
+            _register(name, "make_rwrl_env", {"domain": domain, "task": "walk", "level": level})
 
 
 def _register(name: str, function: str, kwargs: dict[str, str]) -> None:

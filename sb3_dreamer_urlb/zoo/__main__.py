@@ -127,7 +127,7 @@ def _plot(rest: list[str]) -> int:
     from rl_zoo3.plots import plot_train
 
     # Folders of runs have a dash where the id has a slash.
-    sys.argv = [parser.prog, *(argument.replace("/", "-") if argument.startswith("urlb/") else argument for argument in rest)]
+    sys.argv = [parser.prog, *(argument.replace("/", "-") if argument.startswith(("urlb/", "rwrl/")) else argument for argument in rest)]
     if own.output:
         plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
     counts: dict[str, int] = {}

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
 from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, env_id
+from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, rwrl_ids, variant_id
 from sb3_dreamer_urlb.zoo.resuming import PRETRAINING_LOGS
 
 #: values of the key ``pretrain_env``: the primal task's environment, or the one that is fine-tuned in
@@ -21,12 +22,17 @@ PRIMAL, SAME = CHOICES = ("primal", "same")
 
 
 def primal_id(name: str) -> str | None:
-    """The id of the environment in which an agent for a task is pre-trained; None for tasks that are not the benchmark's.
+    """The id of the environment in which an agent for a task is pre-trained; None for tasks that have none.
+
+    Perturbed tasks and the variants of a task have their body's, which is neither perturbed nor changed.
 
     :param name: the task's id
     """
     for domain, tasks in URLB_TASKS.items():
-        if name in {env_id(domain, task) for task in tasks}:
+        names = {env_id(domain, task) for task in tasks} | set(rwrl_ids(domain).values())
+        if domain == "jaco":
+            names |= set(map(variant_id, JACO_VARIANT_TASKS))
+        if name in names:
             return env_id(domain, PRIMAL_TASK[domain])
     return None
 

@@ -31,6 +31,7 @@ from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import named_parameters
+from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 from sb3_dreamer_urlb.zoo import configs, pretraining, resuming
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
@@ -137,6 +138,7 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
         raise ValueError(f"learning_rate must be a number or 'lin_' and a number, got {given!r}.")
     for name in WHOLE_NUMBERS & set(hyperparams):
         check_integer(name, hyperparams[name], 1)
+    _use_everywhere(manager, hyperparams.get("env_kwargs"))
     try:
         found: tuple[dict[str, Any], ...] = original(manager, hyperparams)
     except (NameError, SyntaxError) as error:
@@ -150,6 +152,19 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
             hint = f"; did you mean {' or '.join(meant)}?" if meant else f": neither of rl_zoo3's nor of {manager.algo}'s."
             raise ValueError(f"Unknown hyperparameter {name!r}{hint}")
     return found
+
+
+def _use_everywhere(manager: Any, env_kwargs: dict[str, Any] | None) -> None:
+    """rl_zoo3 gives a configuration's arguments of the environment to training alone. Evaluation, films and ``push_to_hub``
+    know those of the command line, which lie in the run's ``args.yml``.
+
+    :param manager: whose environments are made next
+    :param env_kwargs: the command line's where there were some, else the configuration's
+    """
+    if env_kwargs and isinstance(env_kwargs, dict):
+        manager.args.env_kwargs = dict(env_kwargs)
+        if manager._eval_env_kwargs_args is None:
+            manager.eval_env_kwargs = dict(env_kwargs)
 
 
 def _default_config(algorithm: str, env_id: str) -> Path:
@@ -204,6 +219,25 @@ def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwarg
     if kwargs.get("eval_env") or kwargs.get("no_log") or getattr(manager, "pretrain_env", None) is None:
         return original(manager, *args, **kwargs)
     return pretraining.make_envs(lambda: original(manager, *args, **kwargs), manager)
+
+
+def _maybe_normalize(original: Callable[..., Any], manager: Any, env: VecEnv, eval_env: bool) -> VecEnv:
+    """A snapshot's statistics lie beside it, where rl_zoo3 does not look: without them the world model would see other numbers
+    for the same state.
+
+    :raises ValueError: where the configuration does not normalise what the snapshot knows normalised
+    """
+    statistics = beside(Path(manager.trained_agent)) if manager.trained_agent else None
+    if statistics is None or not statistics.is_file() or getattr(manager, "resumed_run", None) is not None:
+        wrapped: VecEnv = original(manager, env, eval_env)
+        return wrapped
+    if not manager.normalize:
+        raise ValueError(
+            f"{manager.trained_agent} saw its observations through VecNormalize, {statistics.name} has the statistics: "
+            f"the configuration must say so, normalize: {{norm_reward: false}}."
+        )
+    print(f"Observations are normalised as {statistics} says.")
+    return load_vec_normalize(statistics, env, training=not eval_env)
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
@@ -275,6 +309,7 @@ _AROUND: dict[str, Callable[..., Any]] = {
     "read_hyperparameters": _read_hyperparameters,
     "_preprocess_hyperparams": _preprocess_hyperparams,
     "create_envs": _create_envs,
+    "_maybe_normalize": _maybe_normalize,
     "create_callbacks": _create_callbacks,
     "_load_pretrained_agent": _load_pretrained_agent,
     "_save_config": _save_config,
