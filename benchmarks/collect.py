@@ -25,6 +25,7 @@ import torch as th
 from common import Floor, parser, report
 
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, make_control_env, make_urlb_env
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -267,6 +268,7 @@ def draw(times: dict[str, list[float]], path: Path) -> None:
     figure.savefig(path, dpi=80)
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Sweep over domains and numbers of environments; backends and kinds take turns."""
     choice = parser(__doc__)

@@ -20,6 +20,7 @@ from common import Floor, Product, interleaved, make_model, parser, report, tflo
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.learning.learner import Learner
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 #: curve → its points
 POINTS: dict[str, list[int]] = {
@@ -119,6 +120,7 @@ def draw(times: dict[str, dict[int, float]], floors: dict[str, dict[int, float]]
     figure.savefig(path, dpi=80)
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Measure all points in turns."""
     choice = parser(__doc__)

@@ -8,11 +8,13 @@ from functools import partial
 from common import NoiseImages, interleaved, parser, report, set_threads
 
 from sb3_dreamer_urlb import DrQv2
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 PHASES = {"task": None, "pre-training": "disagreement"}
 SIZE = 84
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time an update on a task and one of pre-training; sampling, which a thread may do meanwhile, is timed apart."""
     choice = parser(__doc__)

@@ -35,6 +35,7 @@ from stopwatch import OTHER, Stopwatch
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, make_urlb_env
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 ENV, ACTING, PLANNING, ADD, SAMPLE, UPDATE = "environment", "acting", "planning", "replay add", "replay sample", "update"
 PARTS = (ENV, ACTING, PLANNING, ADD, SAMPLE, UPDATE, OTHER)
@@ -245,6 +246,7 @@ def show(row: str, result: dict[str, Any]) -> None:
         )
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Run each phase in each format and print where its time goes."""
     choice = parser(__doc__)

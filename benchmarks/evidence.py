@@ -38,6 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback, __version__
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.rows import Row
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize, save_vec_normalize
 
 #: any task of dm_control's suite
@@ -215,6 +216,7 @@ def work(minutes: float, at_most: int | None, body: str | None = None, size: str
                 count += 1
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.open_loop import predict_open_loop
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 STATES = study.SETTINGS["state"]
 #: observations that a model sees; steps that it then predicts
@@ -90,6 +91,7 @@ def measure(task: str, seed: int) -> list[tuple[str, int, list[float]]]:
     return found
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

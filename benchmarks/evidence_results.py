@@ -22,6 +22,7 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.aggregate import iqm
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 from sb3_dreamer_urlb.evaluation.style import COLORS, frames_label, new_figure
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 MEASURES = ("whole", "last quarter", "end, actor", "end, Dyna-MPC")
 LABELS = {
@@ -131,6 +132,7 @@ def draw(path: Path) -> None:
     plt.close(figure)
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

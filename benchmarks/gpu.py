@@ -28,6 +28,7 @@ from common import NoiseImages, machine
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.learning.graphs import WARM_UPS
 from sb3_dreamer_urlb.learning.learner import Learner
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.types import SequenceBatch
 
 MODES = {"eager": "eager", "graphs": "cuda_graphs"}
@@ -286,6 +287,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     return options.parse_args(arguments)
 
 
+@ending_with_its_reader()
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; 2 without the device, 1 if a row failed."""
     options = parse(arguments)

@@ -9,10 +9,12 @@ from common import machine, make_model, parser, seconds, write_json
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 REFERENCE = "lbs"
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time a pre-training update of each method; the methods take turns."""
     options = parser(__doc__).parse_args()

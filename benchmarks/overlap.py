@@ -21,11 +21,13 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import sb3_dreamer_urlb  # noqa: F401  registers the environments
 from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 WARM_UP = 80
 PLAIN, OVERLAPPED, UPDATE, ACTION, STEP = "taking turns", "overlapped", "an update", "an action", "a step"
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time both loops by the wall clock, and their parts by the clock asked for."""
     options = parser(__doc__)

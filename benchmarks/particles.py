@@ -21,6 +21,7 @@ import torch as th
 from common import peak_rss, seconds
 
 from sb3_dreamer_urlb.intrinsic.particles import knn_distances
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 CDIST_LIMIT = 10_000  # its n × n matrices: 400 MB each here, 6.4 GB each at paper size
 MB = 1e6
@@ -119,6 +120,7 @@ def ratio(methods: dict[str, dict[str, Any]], name: str) -> str:
     return f"{time:.2f} ({theirs['bytes'] / mine['bytes']:.2f})"
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Print the table: first what the others take as a multiple of ours, then seconds and megabytes."""
     options = parser().parse_args()

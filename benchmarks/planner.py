@@ -15,9 +15,12 @@ import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report, set_threads
 from stable_baselines3.common.utils import get_device
 
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
+
 TFLOP = 0.195
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time ``predict`` on one and on ten environments, with Dyna-MPC in each format and with the actor."""
     options = parser(__doc__).parse_args()

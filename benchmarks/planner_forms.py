@@ -19,6 +19,7 @@ from sb3_dreamer_urlb import DreamerV2, native
 from sb3_dreamer_urlb.agent import Agent, PlannedAgent
 from sb3_dreamer_urlb.dreamer_v2 import policies
 from sb3_dreamer_urlb.native import planner_ops, product_ops, rollout_ops
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.planning.prepared import native_parts, parts
 from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 
@@ -71,6 +72,7 @@ ON_LANES: dict[str, tuple[str, Patches, str | None]] = {
 }
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time ``predict`` on one environment in every form that this processor has."""
     options = parser(__doc__).parse_args()

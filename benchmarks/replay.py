@@ -21,6 +21,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import SequenceReplayBuffer
 from sb3_dreamer_urlb.learning.memory import keep_freed_memory
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.replay.stores import STORES
 
 #: that keep their rows in a folder
@@ -101,6 +102,7 @@ def fill(buffer: SequenceReplayBuffer, episode: list[tuple[Any, ...]]) -> Callab
     return add
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time adding an episode to each store, and drawing a batch from it."""
     choice = parser(__doc__)

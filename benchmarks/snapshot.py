@@ -14,6 +14,7 @@ import torch as th
 from common import Floor, NoiseImages, interleaved, make_model, parser, report
 
 from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 #: seconds that either may take
 LIMIT = 3.0
@@ -33,6 +34,7 @@ def write(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time both."""
     options = parser(__doc__).parse_args()

@@ -14,6 +14,7 @@ import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report
 
 from sb3_dreamer_urlb.learning.learner import Learner
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.types import SequenceBatch
 
 TFLOP = 2.4
@@ -36,6 +37,7 @@ def parts(learner: Learner, batch: SequenceBatch) -> dict[str, Callable[[], obje
     return {"world model": world_model, "behaviour": lambda: learner._update_behavior(state)}
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Time a pre-training update (LBS) and a fine-tuning update in each format."""
     choice = parser(__doc__)

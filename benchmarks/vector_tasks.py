@@ -24,6 +24,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 CONFIG = Path(__file__).parents[1] / "zoo_configs" / "vectors.yml"
 #: mean return of 100 episodes of random actions
@@ -111,6 +112,7 @@ def stem(task: str) -> str:
     return task.split("-")[0].lower()
 
 
+@ending_with_its_reader()
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
@@ -28,6 +29,7 @@ MODULES = (
 )
 
 
+@ending_with_its_reader()
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line and run the command.
 

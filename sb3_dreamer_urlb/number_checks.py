@@ -30,12 +30,16 @@ def is_integer(value: Any) -> bool:
 
 def is_number(value: Any) -> bool:
     """Whether ``value`` is a real number and not NaN."""
-    return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
+    # By comparison: math.isnan has no answer for integers that no float holds.
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(value == value)
 
 
 def is_finite_number(value: Any) -> bool:
-    """Whether ``value`` is a real number, neither NaN nor infinite."""
-    return is_number(value) and math.isfinite(value)
+    """Whether ``value`` is a real number, neither NaN nor infinite, also as a float."""
+    try:
+        return is_number(value) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def check_integer(name: str, value: Any, least: int) -> None:

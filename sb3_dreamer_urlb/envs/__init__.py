@@ -1,8 +1,8 @@
 """The benchmark's environments, from pixels or from states. Importing this imports neither dm_control nor OpenGL.
 
-``registration`` names the tasks and their gymnasium ids; ``dmc`` builds an environment from a name; ``urlb_tasks`` and
-``jaco`` hold the tasks; ``control_env`` is the environment an agent acts in, ``pixel_env`` and ``state_env``
-what it sees of it, ``options`` what one can choose about it;
+``registration`` names the benchmark's tasks and their gymnasium ids, ``task_names`` those of dm_control, too; ``dmc``
+builds an environment from a name; ``urlb_tasks`` and ``jaco`` hold the tasks; ``control_env`` is the environment an agent
+acts in, ``pixel_env`` and ``state_env`` what it sees of it, ``options`` what one can choose about it;
 ``rendering`` finds an OpenGL backend; ``faults`` goes on where an environment raises,
 ``supervisor`` where its process (``worker``) dies or hangs.
 """

@@ -205,6 +205,8 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         given = np.asarray(action)
         if given.shape != self.action_space.shape:
             raise ValueError(f"{self}: action {action!r} of shape {given.shape}, expected {self.action_space.shape}")
+        if not np.can_cast(given.dtype, np.float64, "same_kind"):
+            raise ValueError(f"{self}: action {action!r}, expected numbers")
         values = given.astype(np.float64)
         if not np.isfinite(values).all():
             raise ValueError(f"{self}: action {action!r} is not finite")
@@ -269,4 +271,4 @@ def _episode_length(control_env: control.Environment | composer.Environment, act
         control_steps = control_env._step_limit
     if math.isinf(control_steps):
         return None
-    return math.ceil(math.ceil(round(control_steps, 6)) / action_repeat)
+    return -(-math.ceil(round(control_steps, 6)) // action_repeat)

@@ -8,13 +8,15 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+import numpy as np
 
 from sb3_dreamer_urlb.envs import perturbations as rwrl
 from sb3_dreamer_urlb.envs.domain_rewards import DomainRewards, check_domain
-from sb3_dreamer_urlb.envs.options import PixelOptions, refuse_unknown
+from sb3_dreamer_urlb.envs.options import PixelOptions, check_choice, refuse_unknown
 from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
 from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task
 from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
+from sb3_dreamer_urlb.envs.task_names import check_task
 
 if TYPE_CHECKING:
     from dm_control import composer
@@ -83,8 +85,8 @@ def make_urlb_env(
 
 
 def make_dmc_env(
-    domain: str,
-    task: str,
+    domain: str = "",
+    task: str = "",
     *,
     image_size: int = 64,
     action_repeat: int = 2,
@@ -120,7 +122,8 @@ def make_dmc_env(
     :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
     refuse_unknown(unknown, "domain", "task", "perturbations", "domain_rewards")
-    if not isinstance(domain_rewards, bool):
+    check_task(domain, task)
+    if not isinstance(domain_rewards, bool | np.bool_):
         raise ValueError(f"domain_rewards={domain_rewards!r}: expected True or False")
     if domain_rewards:
         check_domain(domain, task)
@@ -168,8 +171,7 @@ def make_rwrl_env(
     :raises ValueError: naming a wrong option, its value and what was expected
     :raises RenderingBackendError: if pixels are wanted and MuJoCo cannot render here
     """
-    if task != "walk":
-        raise ValueError(f"task={task!r}: the Real-World RL suite's levels are of the task walk")
+    check_choice("task", task, ("walk",), "the Real-World RL suite's levels are of the task")
     perturbed_by = rwrl.level(domain, level, hard_thigh=hard_thigh, keep_buffers=keep_buffers)
     known = {field.name for field in dataclasses.fields(PixelOptions)}
     refuse_unknown(
@@ -244,21 +246,11 @@ def make_control_env(domain: str, task: str) -> control.Environment | composer.E
         renders its physics
     :raises ValueError: if there is no such task; it lists those there are
     """
+    check_task(domain, task)
     load_physics()
-    from dm_control import manipulation, suite
-
     from sb3_dreamer_urlb.envs.jaco import make_jaco_task, make_manipulation_task
     from sb3_dreamer_urlb.envs.urlb_tasks import make_suite_task
 
-    known = {name: tuple(tasks) for name, tasks in suite.TASKS_BY_DOMAIN.items()}
-    known["manipulation"] = tuple(manipulation.ALL)
-    for name, tasks in URLB_TASKS.items():
-        known[name] = (*tasks, *(other for other in known.get(name, ()) if other not in tasks))
-    known["jaco"] += JACO_VARIANT_TASKS
-    if domain not in known:
-        raise ValueError(f"domain={domain!r}: expected one of {', '.join(sorted(known))}")
-    if task not in known[domain]:
-        raise ValueError(f"task={task!r}: {domain} has {', '.join(known[domain])}")
     if domain == "jaco":
         return make_jaco_task(task)
     if domain == "manipulation":

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from sb3_dreamer_urlb.number_checks import is_integer
+
 _MIN_SIZE, _MAX_SIZE = 16, 512  # pixels
 
 #: what an agent may see
 OBSERVATIONS = ("pixels", "state", "both")
+
+#: what ``render()`` may do
+RENDER_MODES = ("rgb_array", "human")
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -46,19 +52,18 @@ class PixelOptions:
     def __post_init__(self) -> None:
         for name in ("image_size", "render_size"):
             size = getattr(self, name)
-            if not _is_int(size) or not _MIN_SIZE <= size <= _MAX_SIZE:
+            if not is_integer(size) or not _MIN_SIZE <= size <= _MAX_SIZE:
                 raise ValueError(f"{name}={size!r}: expected an int from {_MIN_SIZE} to {_MAX_SIZE}")
-        if not _is_int(self.action_repeat) or self.action_repeat < 1:
+        if not is_integer(self.action_repeat) or self.action_repeat < 1:
             raise ValueError(f"action_repeat={self.action_repeat!r}: expected an int of at least 1")
-        if not _is_int(self.camera) and not isinstance(self.camera, str):
+        if not is_integer(self.camera) and not isinstance(self.camera, str):
             raise ValueError(f"camera={self.camera!r}: expected a camera's id (int) or name (str)")
         for name in ("reward_free", "fast_render"):
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ValueError(f"{name}={getattr(self, name)!r}: expected True or False")
-        if self.render_mode not in (None, "rgb_array", "human"):
-            raise ValueError(f"render_mode={self.render_mode!r}: expected None, 'rgb_array' or 'human'")
-        if self.observation not in OBSERVATIONS:
-            raise ValueError(f"observation={self.observation!r}: expected one of {', '.join(map(repr, OBSERVATIONS))}")
+        if self.render_mode is not None:
+            check_choice("render_mode", self.render_mode, RENDER_MODES, "expected None or one of")
+        check_choice("observation", self.observation, OBSERVATIONS)
         self._refuse_what_has_no_effect()
 
     def _refuse_what_has_no_effect(self) -> None:
@@ -85,6 +90,14 @@ def refuse_unknown(unknown: dict[str, Any], *others: str) -> None:
         )
 
 
-def _is_int(value: Any) -> bool:
-    """Whether a value is an integer, numpy's included and bool excluded."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+def check_choice(name: str, value: Any, known: Sequence[str], there_are: str = "expected one of") -> None:
+    """
+    :param name: of an option
+    :param value: what was given
+    :param known: what may be given
+    :param there_are: what the message says before it lists them
+    :raises ValueError: naming the option, its value and the known ones
+    """
+    # Of another type there is no asking "in": a list has no hash, and arrays compare number by number.
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name}={value!r}: {there_are} {', '.join(known)}")

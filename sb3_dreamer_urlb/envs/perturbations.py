@@ -5,14 +5,14 @@ Imports nothing heavy: wrong numbers are refused before MuJoCo loads.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from sb3_dreamer_urlb.envs.options import UnknownOptionError
+from sb3_dreamer_urlb.envs.options import UnknownOptionError, check_choice
+from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
 
 #: the suite's degrees of intensity
 LEVELS = ("easy", "medium", "hard")
@@ -32,6 +32,9 @@ _LENGTHS = {
 }
 #: The thigh's range at the level hard: the suite's own code has the first, the paper's table the second.
 HARD_THIGHS = {"suite": _LENGTHS["walker"]["hard"], "paper": (0.15, 0.55)}
+
+#: Metres that a limb may have. With more, MuJoCo's numbers are soon invalid.
+LEAST_LENGTH, MOST_LENGTH = 0.01, 10
 
 
 @dataclass(frozen=True)
@@ -63,14 +66,19 @@ class Perturbations:
     keep_buffers: bool = True
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            object.__setattr__(self, field.name, value.tolist() if isinstance(value, np.ndarray) else plain(value))
         for name in ("action_delay", "reward_delay"):
-            self._check(name, _is_int(getattr(self, name)) and getattr(self, name) >= 0, "an int of at least 0")
+            self._check(name, is_integer(getattr(self, name)) and getattr(self, name) >= 0, "an int of at least 0")
         held = self.action_repetition
-        self._check("action_repetition", held is None or (_is_int(held) and held >= 1), "None or an int of at least 1")
+        self._check("action_repetition", held is None or (is_integer(held) and held >= 1), "None or an int of at least 1")
         probability = self.repetition_probability
-        self._check("repetition_probability", _is_number(probability) and 0 <= probability <= 1, "a number from 0 to 1")
-        self._check("action_noise", _is_number(self.action_noise) and self.action_noise >= 0, "a finite number of at least 0")
-        self._check("keep_buffers", isinstance(self.keep_buffers, bool | np.bool_), "True or False")
+        self._check("repetition_probability", is_finite_number(probability) and 0 <= probability <= 1, "a number from 0 to 1")
+        self._check(
+            "action_noise", is_finite_number(self.action_noise) and self.action_noise >= 0, "a finite number of at least 0"
+        )
+        self._check("keep_buffers", isinstance(self.keep_buffers, bool), "True or False")
         for name in LIMBS.values():
             self._check_length(name)
 
@@ -79,13 +87,14 @@ class Perturbations:
         length = getattr(self, name)
         if length is None:
             return
-        if isinstance(length, list | tuple | np.ndarray):
-            ends = tuple(length)
-            good = len(ends) == 2 and all(_is_number(end) for end in ends) and 0 < ends[0] <= ends[1]
-            self._check(name, good, "a range (least, most) of positive metres")
-            object.__setattr__(self, name, (float(ends[0]), float(ends[1])))
+        metres = f"metres, {LEAST_LENGTH} to {MOST_LENGTH}"
+        if isinstance(length, list | tuple):
+            good = len(length) == 2 and all(map(_is_length, length)) and length[0] <= length[1]
+            self._check(name, good, f"a range (least, most) of {metres}")
+            object.__setattr__(self, name, (float(length[0]), float(length[1])))
         else:
-            self._check(name, _is_number(length) and length > 0, "positive metres, or a range of them")
+            self._check(name, _is_length(length), f"{metres}, or a range of them")
+            object.__setattr__(self, name, float(length))
 
     def _check(self, name: str, good: bool, expected: str) -> None:
         if not good:
@@ -102,6 +111,10 @@ class Perturbations:
                 raise ValueError(f"{name}={getattr(self, name)!r}: only the {body} has it, not {domain}")
         length: float | tuple[float, float] | None = getattr(self, LIMBS[domain]) if domain in LIMBS else None
         return length
+
+
+def _is_length(value: Any) -> bool:
+    return is_finite_number(value) and LEAST_LENGTH <= value <= MOST_LENGTH
 
 
 def make_perturbations(given: Perturbations | Mapping[str, Any] | None) -> Perturbations | None:
@@ -131,12 +144,9 @@ def level(domain: str, name: str, *, hard_thigh: str = "suite", keep_buffers: bo
     :param keep_buffers: see :class:`Perturbations`
     :raises ValueError: naming what is wrong and what there is
     """
-    if domain not in LIMBS:
-        raise ValueError(f"domain={domain!r}: the Real-World RL suite's levels are of {', '.join(LIMBS)}")
-    if name not in LEVELS:
-        raise ValueError(f"level={name!r}: expected one of {', '.join(LEVELS)}")
-    if hard_thigh not in HARD_THIGHS:
-        raise ValueError(f"hard_thigh={hard_thigh!r}: expected one of {', '.join(map(repr, HARD_THIGHS))}")
+    check_choice("domain", domain, tuple(LIMBS), "the Real-World RL suite's levels are of")
+    check_choice("level", name, LEVELS)
+    check_choice("hard_thigh", hard_thigh, tuple(HARD_THIGHS))
     length = _LENGTHS[domain][name]
     if hard_thigh != "suite":
         if (domain, name) != ("walker", "hard"):
@@ -144,11 +154,3 @@ def level(domain: str, name: str, *, hard_thigh: str = "suite", keep_buffers: bo
         length = HARD_THIGHS[hard_thigh]
     arguments = {**_COMMON[name], LIMBS[domain]: length}
     return Perturbations(**arguments, keep_buffers=keep_buffers)
-
-
-def _is_int(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool) and math.isfinite(value)

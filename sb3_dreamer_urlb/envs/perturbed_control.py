@@ -14,7 +14,7 @@ import dm_env
 import numpy as np
 import numpy.typing as npt
 
-from sb3_dreamer_urlb.envs.perturbations import Perturbations
+from sb3_dreamer_urlb.envs.perturbations import LIMBS, Perturbations
 from sb3_dreamer_urlb.envs.rendering import load_physics
 
 load_physics()
@@ -50,9 +50,8 @@ class Delay(Generic[Item]):
         self._waiting.clear()
 
     def __call__(self, item: Item) -> Item:
-        # The first item fills the buffer, so it comes back steps + 1 times.
-        self._waiting.extend([item] * (1 if self._waiting else self.steps + 1))
-        return self._waiting.popleft()
+        self._waiting.append(item)
+        return self._waiting.popleft() if len(self._waiting) > self.steps else self._waiting[0]
 
 
 class PerturbedControl(dm_env.Environment):
@@ -92,14 +91,24 @@ class PerturbedControl(dm_env.Environment):
         self._clear()
 
     def reset(self) -> dm_env.TimeStep:
-        """Begin an episode, with limbs of another length."""
+        """Begin an episode, with limbs of another length.
+
+        :raises RuntimeError: if dm_control finds no pose to begin with; it names the length
+        """
         if not self.perturbations.keep_buffers:
             self._clear()
         if self._limb is not None:
             self.length = self._draw_length()
             self._control.physics.free()
             self._control._physics = _stretched(self._control.physics, self._domain, self._task, self.length)
-        return self._control.reset()
+        try:
+            return self._control.reset()
+        except RuntimeError as error:  # below 10 cm of shin, the quadruped always touches the ground
+            if self._limb is None or isinstance(error, control.PhysicsError):
+                raise
+            raise RuntimeError(
+                f"{LIMBS[self._domain]}={self.length}: {self._domain}-{self._task} cannot begin: {error}"
+            ) from error
 
     def step(self, action: npt.NDArray[np.float64]) -> dm_env.TimeStep:
         """One control step.

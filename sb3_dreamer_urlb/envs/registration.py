@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gymnasium
 
+from sb3_dreamer_urlb.envs.options import check_choice
 from sb3_dreamer_urlb.envs.perturbations import LEVELS
 
 #: The three domains with four tasks each (URLB, Laskin et al. 2021).
@@ -41,10 +42,8 @@ def env_id(domain: str, task: str) -> str:
 
 def check_urlb_task(domain: str, task: str) -> None:
     """:raises ValueError: if this is not one of the benchmark's tasks; it lists those there are"""
-    if domain not in URLB_TASKS:
-        raise ValueError(f"domain={domain!r}: expected one of {', '.join(DOMAINS)}")
-    if task not in URLB_TASKS[domain]:
-        raise ValueError(f"task={task!r}: {domain} has {', '.join(URLB_TASKS[domain])}")
+    check_choice("domain", domain, DOMAINS)
+    check_choice("task", task, URLB_TASKS[domain], f"{domain} has")
 
 
 def variant_id(task: str) -> str:

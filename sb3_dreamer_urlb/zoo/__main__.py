@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import how_to_install
 
 COMMANDS = {
@@ -24,6 +25,7 @@ COMMANDS = {
 }
 
 
+@ending_with_its_reader()
 def main(argv: Sequence[str] | None = None) -> int:
     """Register our algorithms and hand over to rl_zoo3.
 
@@ -127,7 +129,10 @@ def _plot(rest: list[str]) -> int:
     from rl_zoo3.plots import plot_train
 
     # Folders of runs have a dash where the id has a slash.
-    sys.argv = [parser.prog, *(argument.replace("/", "-") if argument.startswith(("urlb/", "rwrl/")) else argument for argument in rest)]
+    sys.argv = [
+        parser.prog,
+        *(argument.replace("/", "-") if argument.startswith(("urlb/", "rwrl/")) else argument for argument in rest),
+    ]
     if own.output:
         plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
     counts: dict[str, int] = {}

@@ -56,31 +56,6 @@ def test_the_names():
         register_envs()  # again: nothing overridden
 
 
-@pytest.mark.parametrize(("domain", "task"), TASKS)
-def test_the_checkers_have_nothing_to_say(domain, task, monkeypatch):
-    """One task a domain with its pictures; the others' pictures are made of the bytes of their state, which is much cheaper
-    (the checkers reset some twenty times) and as deterministic as the simulation is.
-    """
-    drawn = task == PRIMAL_TASK[domain]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(env_id(domain, task), render_mode="rgb_array")
-        if not drawn:
-            control_env = env.unwrapped._control
-            monkeypatch.setattr(
-                env.unwrapped,
-                "_picture",
-                lambda size: np.resize(control_env.physics.data.qpos.copy().view(np.uint8), (size, size, 3)),
-            )
-        gymnasium_check_env(env.unwrapped, skip_render_check=not drawn, skip_close_check=not drawn)
-        sb3_check_env(env.unwrapped)
-        env.reset(seed=3)  # with gymnasium.make's own wrappers
-        env.step(env.action_space.sample())
-        assert env.render().shape == (256, 256, 3)
-        env.close()
-        env.close()
-
-
 def test_spaces_and_attributes():
     env = gymnasium.make("urlb/quadruped-walk-v0")
     assert env.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
