@@ -272,3 +272,37 @@ def test_json_without_a_file_replaces_the_table(load, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["planner", "--quick", "--json", "--precision", "float32"])
     load("planner").main()
     assert json.loads(capsys.readouterr().out)["threads"] == th.get_num_threads()
+
+
+def test_states(run, load):
+    table, result = run("states")
+    assert table.startswith("states: device ")
+    assert list(result["seconds"]) == ["walker, pixels", "walker, state", "update, tiny", "action, tiny"]
+    assert result["ratios"].keys() == {"walker, pixels"} and is_positive(result["ratios"].values())
+    taken = result["fine_tuning"]["tiny"]
+    assert taken["steps"] == 20 and is_positive(taken.values())
+    assert result["notes"][1].startswith("tiny: 20 agent steps of it took") and result["notes"][0].endswith("(projected)")
+    # S · (step + action) + U · update, of what the preset does in 50 000 agent steps
+    model = load("states").DreamerV2("MlpPolicy", "Pendulum-v1", preset="tiny", device="cpu")
+    step, act, update = (min(result["seconds"][row]) for row in ("walker, state", "action, tiny", "update, tiny"))
+    updates = (50_000 - model.learning_starts) // model.train_freq.frequency
+    assert taken["projected seconds"] == pytest.approx(50_000 * (step + act) + updates * update, rel=1e-3)
+
+
+def test_settings_from_states(load, monkeypatch, tmp_path, capsys):
+    """Runs that are missing are done once and kept; the table says what each scored at the end."""
+    script = load("state_settings")
+    monkeypatch.setattr(script, "FILE", tmp_path / "rows.csv")
+    monkeypatch.setattr(script, "LAST", 1)
+    monkeypatch.setattr(script, "SETTINGS", {"mine": ("tiny", {"train_freq": 50}), "other": ("tiny", {})})
+    for _ in range(2):
+        for settings in (["mine"], [script.RANDOM]):
+            options = ["--steps", "1000", "--tasks", "walk", "--settings", *settings]
+            monkeypatch.setattr(sys, "argv", ["state_settings", "run", *options])
+            script.main()
+    assert [row.setting for row in script.read()] == ["mine", script.RANDOM] and len(capsys.readouterr().out.splitlines()) == 2
+    assert all(len(row.returns) == 2 and row.steps == 1000 and row.seconds > 0 for row in script.read())
+    monkeypatch.setattr(sys, "argv", ["state_settings", "table"])
+    script.main()
+    line = capsys.readouterr().out.splitlines()[2]
+    assert line.startswith(f"| mine | 1000 | {script.read()[0].returns[-1]:.0f} |  | ")

@@ -264,7 +264,7 @@ def test_cameras_by_id_and_by_name(domain, name, number):
         ({"camera": 1.0}, r"camera=1.0: expected a camera's id \(int\) or name \(str\)"),
         ({"reward_free": "no"}, r"reward_free='no': expected True or False"),
         ({"fast_render": 1}, r"fast_render=1"),
-        ({"render_mode": "ansi"}, r"render_mode='ansi': expected None, 'rgb_array' or 'human'"),
+        ({"render_mode": "ansi"}, r"render_mode='ansi': expected None or one of rgb_array, human"),
     ],
 )
 def test_wrong_options_are_named(options, message):
