@@ -3,8 +3,8 @@
     python benchmarks/state_settings.py run --minutes 60      # the next missing runs, one thread
     python benchmarks/state_settings.py table                 # what they say
 
-Each setting is a preset and changes to it; each run has one seed and learns walk or run for 5000 agent steps (10 episodes)
-without a pre-training. One seed tells settings apart that fail, not those that are alike. Rows lie in
+Each setting is a preset and changes to it; each run has one seed and learns walk or run for 10 000 agent steps (20
+episodes) without a pre-training. One seed tells settings apart that fail, not those that are alike. Rows lie in
 ``results/state_settings.csv``.
 """
 
@@ -28,7 +28,7 @@ from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
 FILE = Path(__file__).parents[1] / "results" / "state_settings.csv"
-STEPS = 5000
+STEPS = 10_000
 TASKS = ("walk", "run")
 #: name → preset, and what is changed; most telling first
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {

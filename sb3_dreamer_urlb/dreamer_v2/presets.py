@@ -72,7 +72,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # dm_control tasks from states through VecNormalize(norm_reward=False): the paper's sizes and rates. Only the KL is
     # cheaper, for the reason given above: a state says less in nats than 64 x 64 pixels.
     "state": {"train_freq": 5, "kl_scale": 0.1, "policy_kwargs": {"deter_size": 200}},
-    # The same on one CPU core; found by trial on the walker, docs/tasks.md says what was measured. Whole episodes are
+    # The same on one CPU core; found by trial on the walker, docs/notes/states.md says what was measured. Whole episodes are
     # long enough for sequences that stay in one.
     "state-small": {
         "learning_rate": 6e-4,
