@@ -97,7 +97,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
         if getattr(options, "conf_file", manager.config) is None:
             manager.config = str(_default_config(manager.algo, manager.env_name.gym_id))
         else:
-            manager.config = configs.resolve(manager.config)
+            manager.config = configs.resolve(manager.config, manager.algo)
             configs.check(manager.config, manager.env_name.gym_id)
         hyperparams, config = original(manager)
     if manager.n_timesteps <= 0 and "n_timesteps" not in hyperparams:

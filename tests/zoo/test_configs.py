@@ -12,6 +12,7 @@ import pytest
 from places import ROOT
 
 from sb3_dreamer_urlb.zoo import configs
+from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 
 
 @pytest.mark.parametrize("name", ["lbs", "lbs.yml", "small/lbs", "small/lbs.yml", "vectors"])
@@ -25,6 +26,34 @@ def test_a_file_wins_and_modules_stay(monkeypatch, tmp_path):
     (tmp_path / "lbs.yml").touch()
     assert configs.resolve("lbs.yml") == "lbs.yml"
     assert configs.resolve("json.decoder") == "json.decoder"
+
+
+@pytest.mark.parametrize("name", ["scratch", "small/scratch.yml", "disagreement", "drq_v2/scratch", "drq_v2/small/scratch"])
+def test_short_names_are_those_of_the_algorithm(monkeypatch, tmp_path, name):
+    monkeypatch.chdir(tmp_path)
+    file = f"{name.removeprefix('drq_v2/').removesuffix('.yml')}.yml"
+    assert configs.resolve(name, "drq_v2") == str(ROOT / "zoo_configs" / "drq_v2" / file)
+
+
+@pytest.mark.parametrize(
+    ("name", "algorithm", "other"),
+    [
+        ("lbs", "drq_v2", "dreamerv2"),
+        ("small/lbs", "drq_v2", "dreamerv2"),
+        (str(ROOT / "zoo_configs" / "scratch.yml"), "drq_v2", "dreamerv2"),
+        ("disagreement", "dreamerv2", "drq_v2"),
+        ("drq_v2/scratch", "dreamerv2", "drq_v2"),
+        (str(ROOT / "zoo_configs" / "drq_v2" / "small" / "scratch.yml"), "dreamerv2", "drq_v2"),
+    ],
+)
+def test_a_file_of_another_algorithm_is_refused(name, algorithm, other):
+    with pytest.raises(ValueError, match=f"-conf .* is for --algo {other}, not {algorithm}, which has .*scratch, "):
+        configs.resolve(name, algorithm)
+
+
+def test_every_file_is_some_algorithms_and_no_two_s():
+    found = [name for algorithm in ALGORITHMS for name in set(configs.names_for(algorithm).values())]
+    assert sorted(found) == configs.names()
 
 
 @pytest.mark.parametrize("name", ["lsb", "small/lsb.yml", "no/such.yml", "nowhere.py", "no.module", "../lbs", ""])

@@ -76,7 +76,7 @@ def test_a_run_through_both_phases_that_goes_on(zoo, capsys):
     assert (model.phase, model.phase_timesteps, model.pretrained_frames) == ("finetuning", 20, 80)
     zoo(*TRAIN, "--env", STAND, "-n", "68", "-i", "logs/drq_v2/urlb-walker-stand-v0_1")
     assert model_of(STAND, 1).phase_timesteps == 28
-    zoo(*TRAIN, "--env", FLIP, "-n", "24", "-conf", "drq_v2/finetune",
+    zoo(*TRAIN, "--env", FLIP, "-n", "24", "-conf", "finetune",
         "-i", "logs/drq_v2/urlb-walker-stand-v0_1/snapshots/snapshot_80.zip")  # fmt: skip
     tuned = model_of(FLIP, 1)
     assert (tuned.phase, tuned.phase_timesteps, tuned.intrinsic_reward) == ("finetuning", 24, "disagreement")
