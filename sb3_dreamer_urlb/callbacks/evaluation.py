@@ -16,7 +16,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row
-from sb3_dreamer_urlb.evaluation.episodes import AUTO, EPISODES, OFF, ON, PLANNERS, SEED, Evaluation, run_evaluation
+from sb3_dreamer_urlb.evaluation.episodes import (
+    AUTO,
+    EPISODES,
+    OFF,
+    ON,
+    PLANNERS,
+    SEED,
+    Evaluation,
+    run_evaluation,
+    without_planner,
+)
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PHASES
 
@@ -109,7 +119,7 @@ class EvaluationCallback(EvalCallback):
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:
             raise ValueError("Rows tell runs apart by their seed: give the model one, or columns={'seed': ...}.")
         if self.planner == ON and getattr(self.model, "planner", None) is None:
-            raise ValueError("planner='on': the model has none.")
+            raise ValueError(without_planner(self.model))
         # An evaluation that was due before the run was cut off has been.
         self._due = (self._dreamer.phase, self._dreamer.phase_frames // self.every_frames)
 

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+#: where runs of rl_zoo3 keep themselves
+IN_RUNS_OF_THE_ZOO = "checkpoint"
+
 
 def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     """Which environment, and what episodes.
@@ -91,10 +94,19 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
 
 
 def _file(snapshot: Path) -> Path:
-    """Of a run folder, its last checkpoint."""
+    """Of a run folder, its last checkpoint; also where rl_zoo3 keeps it, in a folder of the run's.
+
+    :raises FileNotFoundError: if a folder has none
+    """
     from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
 
-    return snapshot / SNAPSHOT if snapshot.is_dir() else snapshot
+    if not snapshot.is_dir():
+        return snapshot
+    places = [snapshot / SNAPSHOT, snapshot / IN_RUNS_OF_THE_ZOO / SNAPSHOT]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise FileNotFoundError(f"{snapshot} has no checkpoint: neither {' nor '.join(map(str, places))} is there.")
+    return found
 
 
 def pairs(option: str, texts: Any) -> dict[str, str]:

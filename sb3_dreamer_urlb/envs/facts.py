@@ -34,7 +34,7 @@ def env_attribute(env: VecEnv, name: str, default: Any) -> Any:
     """An attribute of the first environment, through all wrappers; ``default`` where there is none that can be had.
 
     :param env: of which the first is asked
-    :param name: of those that are Gymnasium's: ``"spec"``, ``"metadata"``
+    :param name: of those that are Gymnasium's, ``"spec"``, ``"metadata"``; a key of ``FACTS``, or ``CLASS``
     :param default: instead
     """
     value = _told(env, name)

@@ -34,6 +34,8 @@ FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
 OF_GYMNASIUM = ("spec", "metadata")
 #: steps after which an episode ends, whoever ends it
 STEPS = "steps_an_episode"
+#: name of the class of the environment itself
+CLASS = "unwrapped_class"
 #: attribute of the outermost wrapper with what was told
 TOLD = "_told_in_its_process"
 
@@ -60,6 +62,7 @@ def tell(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
         counts += [_read(part.__getattribute__, name) for name in ("max_episode_steps", "_max_episode_steps")]
         part = part.env if isinstance(part, gymnasium.Wrapper) else None
     told[STEPS] = fewest_steps(told, counts)
+    told[CLASS] = type(env.unwrapped).__name__
     return told
 
 

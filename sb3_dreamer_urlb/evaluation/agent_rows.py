@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.told import CLASS
 from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 from sb3_dreamer_urlb.evaluation.names import columns_of_id
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row
@@ -90,25 +92,19 @@ def env_columns(env: VecEnv) -> dict[str, Any]:
 
     :param env: vectorised
     """
-    spec = _attribute(env, "spec")
+    spec = env_attribute(env, "spec", None)
     columns: dict[str, Any] = {} if spec is None else dict(columns_of_id(spec.id))
     given = {} if spec is None else spec.kwargs
     if columns.get("domain", "gymnasium") == "gymnasium":
         # An id without a domain of its own: what the environment says counts.
-        said = {name: given.get(name, _attribute(env, name)) for name in ("domain", "task")}
+        said = {name: given.get(name, env_attribute(env, name, None)) for name in ("domain", "task")}
         columns |= {name: value for name, value in said.items() if isinstance(value, str) and value}
     columns.setdefault("domain", "gymnasium")
-    columns.setdefault("task", type(env).__name__)
+    if "task" not in columns:
+        columns["task"] = env_attribute(env, CLASS, type(env.unwrapped).__name__)
     if isinstance(given.get("observation"), str) and given["observation"] != "pixels":
         columns["observation"] = given["observation"]
     return columns
-
-
-def _attribute(env: VecEnv, name: str) -> Any:
-    try:
-        return env.get_attr(name, indices=0)[0]
-    except AttributeError:
-        return None
 
 
 def versions() -> str:

@@ -157,13 +157,20 @@ class _Chosen:
             self.policy.planning = before
 
 
+def without_planner(model: Any) -> str:
+    """What to say of ``planner="on"`` to who has none."""
+    if hasattr(model, "planner"):
+        return "planner='on': the model has none; load it with planner='dyna_mpc', say."
+    return f"planner='on': {type(model).__name__} has no planner."
+
+
 def _acting(model: Any, planner: str) -> tuple[PolicyPredictor, str]:
     """Who is asked for actions, and the name of its planner."""
     if planner not in PLANNERS:
         raise ValueError(f"planner must be one of {PLANNERS}, got {planner!r}.")
     name = planner_name(getattr(model, "planner", None))
     if planner == ON and name is None:
-        raise ValueError("planner='on': the model has none; load it with planner='dyna_mpc', say.")
+        raise ValueError(without_planner(model))
     plans = name is not None and (planner == ON or (planner == AUTO and model._planner_is_on()))
     chosen = model if name is None or planner == AUTO else _Chosen(model, plans)
     return chosen, str(name) if plans else "none"

@@ -175,6 +175,25 @@ def test_the_model_free_agent_is_evaluated_alike(tmp_path: Path) -> None:
     ]
 
 
+def test_who_has_no_planner_says_so(tmp_path: Path, capsys: Any) -> None:
+    model = DrQv2("CnnPolicy", CounterEnv(5), preset="tiny", seed=0, device="cpu")
+    model.save(tmp_path / "agent")
+    command = ["evaluate", str(tmp_path / "agent.zip"), "--env", "Counter-v0", "--device", "cpu", "--planner", "on"]
+    assert main(command) == 2
+    assert "planner='on': DrQv2 has no planner" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="planner='on': DrQv2 has no planner"):
+        model.learn(4, EvaluationCallback(CounterEnv(5), planner="on"))
+
+
+def test_the_command_takes_the_folder_of_a_run_of_the_zoo(tiny_model: Any, tmp_path: Path, capsys: Any) -> None:
+    run = tmp_path / "logs" / "run_1"
+    tiny_model(CounterEnv(5)).learn(8, RunCheckpointCallback(run / "checkpoint", every_frames=4))
+    command = ["--env", "Counter-v0", "--env-kwargs", "length=5", "--episodes", "1", "--device", "cpu"]
+    assert main(["evaluate", str(run), *command]) == 0
+    assert main(["evaluate", str(tmp_path), *command]) == 2
+    assert f"{tmp_path} has no checkpoint" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -178,7 +178,14 @@ def test_columns_of_the_environment() -> None:
     env = make_vec_env("urlb/dm_control-v0", 1, env_kwargs={"domain": "cartpole", "task": "balance"})
     assert env_columns(env) == {"domain": "cartpole", "task": "balance"}
     env.close()
-    assert env_columns(seeds(1)) == {"domain": "gymnasium", "task": "DummyVecEnv"}
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("wrapper", [Monitor, gymnasium.wrappers.RecordEpisodeStatistics])
+def test_an_environment_without_an_id_is_called_after_its_class(kind: Any, wrapper: Any) -> None:
+    env = VecNormalize(kind([lambda: wrapper(CounterEnv(5))]), norm_obs=False)
+    assert env_columns(env) == {"domain": "gymnasium", "task": "CounterEnv"}
+    env.close()
 
 
 def test_random_actions_for_comparison() -> None:
