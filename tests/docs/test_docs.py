@@ -22,6 +22,7 @@ from places import ROOT
 import sb3_dreamer_urlb
 from sb3_dreamer_urlb import dreamer_v2, envs, hub, planning
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
+from sb3_dreamer_urlb.drq_v2.presets import PRESETS as DRQ_PRESETS
 from sb3_dreamer_urlb.envs import supervisor
 from sb3_dreamer_urlb.intrinsic import registry
 
@@ -56,9 +57,10 @@ def code_blocks(page: str | Path) -> list[str]:
 def small_world(monkeypatch, tmp_path):
     """A cheap walker for the benchmark's tasks, the smallest networks, an empty folder."""
     monkeypatch.chdir(tmp_path)
-    for name in PRESETS:
-        monkeypatch.setitem(PRESETS, name, PRESETS["tiny"])
-    monkeypatch.setattr(registry, "_REGISTRY", registry.registered_intrinsic_rewards())
+    for presets in (PRESETS, DRQ_PRESETS):
+        for name in presets:
+            monkeypatch.setitem(presets, name, presets["tiny"])
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
     asked, really_make = [], gymnasium.make
 
     def make(name, **kwargs):
@@ -151,6 +153,12 @@ def after_evaluate(names, folder):
 def after_resume(names, folder):
     assert (folder / "runs" / "walker" / "snapshot.zip").exists()
     assert names["model"].num_timesteps == 240
+
+
+def after_drq_v2(names, folder):
+    assert names["model"].phase == "finetuning" and names["model"]._n_updates > 0 and names["done"]
+    assert (folder / "pretrained.zip").exists() and names["own"]._n_updates > 0
+    assert names["state"][0].shape[:2] == (1, 3)
 
 
 def after_share(names, folder):
