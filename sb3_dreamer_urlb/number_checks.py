@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -51,6 +52,28 @@ def check_integer(name: str, value: Any, least: int) -> None:
     """
     if not is_integer(value) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}.")
+
+
+def check_switch(name: str, value: Any) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :raises ValueError: for anything but True and False
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}.")
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was given
+    :param choices: what it may be
+    :raises ValueError: for anything else
+    """
+    # An array would be compared number by number.
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(f"{name} must be one of {tuple(choices)}, got {value!r}.")
 
 
 def check_dict(name: str, value: Any) -> None:

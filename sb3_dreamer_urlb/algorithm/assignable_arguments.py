@@ -14,6 +14,10 @@ class AssignableArguments(SavedAlgorithm):
 
     #: arguments that are in force from the next step or update on when they are assigned; None lets all be assigned unchecked
     assignable: ClassVar[frozenset[str] | None] = None
+    #: arguments that networks were built with, so that no file of them can be loaded with others
+    of_the_networks: ClassVar[frozenset[str]] = frozenset()
+    #: arguments that decide what fine-tuning trains
+    before_fine_tuning: ClassVar[frozenset[str]] = frozenset()
 
     def __setattr__(self, name: str, value: Any) -> None:
         """As ever, but for arguments of a model that is built.
@@ -27,7 +31,7 @@ class AssignableArguments(SavedAlgorithm):
         if name not in self.assignable:
             raise AttributeError(
                 f"{name} cannot be assigned: the model was built with {name}={vars(self).get(name)!r}. "
-                f"To change it: {type(self).__name__}.load(path, {name}=...)."
+                f"To change it: {self._how_to_change(name)}."
             )
         before = vars(self)[name]
         super().__setattr__(name, plain(value))
@@ -36,6 +40,17 @@ class AssignableArguments(SavedAlgorithm):
         except Exception:
             super().__setattr__(name, before)
             raise
+
+    def _how_to_change(self, name: str) -> str:
+        """What works for an argument that cannot be assigned."""
+        me = type(self).__name__
+        if name in self.of_the_networks:
+            return f"make another model, {me}(..., {name}=...), for the networks of this one and of its files keep theirs"
+        if name in self.before_fine_tuning:
+            return (
+                f"make another model, or load the pre-trained one with it, {me}.load(path, {name}=...), and then fine_tune()"
+            )
+        return f"{me}.load(path, {name}=...)"
 
     def _put_in_force(self) -> None:
         """An argument was assigned: check all of them, and tell the parts that hold a copy.

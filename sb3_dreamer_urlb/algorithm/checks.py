@@ -11,7 +11,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
-from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number, is_integer, is_number
+from sb3_dreamer_urlb.number_checks import (
+    check_choice,
+    check_dict,
+    check_integer,
+    check_switch,
+    is_finite_number,
+    is_integer,
+    is_number,
+)
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
@@ -32,6 +40,19 @@ def check_verbose(verbose: Any) -> None:
     """
     if not is_integer(verbose) or not 0 <= verbose <= 2:
         raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
+
+
+def check_learn(total_timesteps: Any, log_interval: Any) -> None:
+    """What ``learn`` is told, before Stable-Baselines3 compares and divides with it.
+
+    :param total_timesteps: agent steps
+    :param log_interval: episodes between two log lines; None for no lines
+    :raises ValueError: for what is no such number
+    """
+    if not is_number(total_timesteps):
+        raise ValueError(f"total_timesteps must be a number of agent steps, got {total_timesteps!r}.")
+    if log_interval is not None:
+        check_integer("log_interval", log_interval, 1)
 
 
 def check_settings(model: SavedAlgorithm) -> None:
@@ -94,26 +115,14 @@ def check_rate(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
 
 
-def check_switch(name: str, value: Any) -> None:
-    """
-    :param name: of the argument, for the message
-    :param value: what was given
-    :raises ValueError: for anything but True and False
-    """
-    if not isinstance(value, bool):
-        raise ValueError(f"{name} must be True or False, got {value!r}.")
-
-
 def check_forms(precision: Any, compile: Any) -> None:
     """
     :param precision: of products
     :param compile: how updates run
     :raises ValueError: for unknown names
     """
-    if precision not in PRECISIONS:
-        raise ValueError(f"precision must be one of {PRECISIONS}, got {precision!r}.")
-    if compile not in COMPILE:
-        raise ValueError(f"compile must be one of {COMPILE}, got {compile!r}.")
+    check_choice("precision", precision, PRECISIONS)
+    check_choice("compile", compile, COMPILE)
 
 
 def check_method(intrinsic_reward: Any, phase: str) -> None:

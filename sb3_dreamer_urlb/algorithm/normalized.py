@@ -1,4 +1,4 @@
-"""What a pre-trained world model is shown of the same state must stay the same in fine-tuning: VecNormalize's statistics."""
+"""What a pre-trained agent is shown of the same state must stay the same in fine-tuning: VecNormalize's statistics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def check(before: VecNormalize | None, after: VecNormalize | None) -> None:
         return
     texts = ["as they are" if how is None else f"through VecNormalize({how})" for how in (mine, its)]
     raise ValueError(
-        f"The world model was pre-trained on observations {texts[0]}, the fine-tuning environment shows them {texts[1]}: "
+        f"The agent was pre-trained on observations {texts[0]}, the fine-tuning environment shows them {texts[1]}: "
         "it would see other numbers for the same state. Wrap the environment as the pre-training's was; the statistics are "
         "carried over."
     )

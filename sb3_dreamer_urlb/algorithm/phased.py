@@ -21,7 +21,7 @@ from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
-from sb3_dreamer_urlb.number_checks import plain
+from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.types import MetricMeans
@@ -65,6 +65,9 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         **kwargs: Any,
     ):
         checks.check_verbose(verbose)
+        for name in ("policy_kwargs", "replay_buffer_kwargs"):
+            # Stable-Baselines3 takes whatever is false for an empty one.
+            check_dict(name, kwargs.get(name))
         super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
         self.intrinsic_reward = intrinsic_reward
         self.overlap = overlap
@@ -114,7 +117,8 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
-            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}.")
+            dicts = f": {type(self).__name__} takes no Dict observations" if policy_name == "MultiInputPolicy" else ""
+            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}{dicts}.")
         return self.policy_aliases[policy_name]
 
     @property
@@ -266,10 +270,12 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         :param tb_log_name: name of the TensorBoard run
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
+        :raises ValueError: for what is no number of steps or episodes
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
         total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
+        checks.check_learn(total_timesteps, log_interval)
         with self.during_learn:
             if resume_if_asked(self, callback):
                 total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False

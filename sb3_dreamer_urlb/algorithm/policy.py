@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_dreamer_urlb.number_checks import check_switch
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.spaces.actions import Actions, make_actions
@@ -36,6 +37,14 @@ class Memory(Protocol):
 AnyMemory = TypeVar("AnyMemory", bound=Memory)
 
 
+def _known_policies(of: type[Any] | None = None) -> Iterator[type[Any]]:
+    """Those of this package that were imported so far, for messages."""
+    for kind in (AgentPolicy if of is None else of).__subclasses__():
+        if kind.__module__.startswith(f"{__name__.split('.')[0]}."):
+            yield kind
+        yield from _known_policies(kind)
+
+
 class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     """An agent's networks behind SB3's policy interface: observe, remember, choose.
 
@@ -47,12 +56,10 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
 
     #: from an observation space, and ``normalize_images``, to what the agent sees; raises UnsupportedSpaceError
     kind_of_observations: ClassVar[Callable[..., Observations]] = Images
-    #: arrays in ``predict(state=…)``
-    memory_parts: ClassVar[int]
-
     agent: nn.Module
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool):
+        check_switch("policy_kwargs: normalize_images", normalize_images)
         super().__init__(observation_space, action_space, normalize_images=normalize_images)
         self.observations = self._observations(observation_space, normalize_images)
         self.actions = self._actions(action_space)
@@ -98,7 +105,7 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
         :param custom_objects: constructor arguments that no file can hold, as an intrinsic reward that is not registered
         :raises SnapshotError: naming the file and why it is refused
         """
-        return policy_snapshot.load(cls, path, device, custom_objects)
+        return policy_snapshot.load(cls, path, device, custom_objects, _known_policies())
 
     # -- acting --------------------------------------------------------------------------------------------------------
 
@@ -131,6 +138,10 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     @abstractmethod
     def _memory_of(self, parts: list[th.Tensor]) -> AnyMemory:
         """Undo ``to_numpy``."""
+
+    @abstractmethod
+    def memory_shapes(self) -> tuple[tuple[int, ...] | None, ...]:
+        """Of the arrays in ``predict(state=…)``, without the leading n; None where any will do."""
 
     # -- SB3's interface -----------------------------------------------------------------------------------------------
 
@@ -180,11 +191,19 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
         return self.actions.to_env(action)
 
     def _memory(self, state: tuple[np.ndarray, ...], n: int) -> AnyMemory:
-        count = self.memory_parts
-        if not isinstance(state, tuple) or len(state) != count:
-            raise ValueError(f"state must be what the last predict() returned, a tuple of {count} arrays, got {type(state)}.")
-        if any(len(part) != n for part in state):
-            raise ValueError(f"state is for {[len(part) for part in state]} environments, the observation for {n}.")
+        shapes = self.memory_shapes()
+        if not isinstance(state, tuple) or len(state) != len(shapes):
+            got = f"a tuple of {len(state)}" if isinstance(state, tuple) else type(state).__name__
+            raise ValueError(f"state must be what the last predict() returned, a tuple of {len(shapes)} arrays, got {got}.")
+        found = [np.shape(part) for part in state]
+        if any(len(shape) == 0 or shape[0] != n for shape in found):
+            raise ValueError(f"state is for {[(*shape, 0)[0] for shape in found]} environments, the observation for {n}.")
+        expected = [its[1:] if shape is None else shape for its, shape in zip(found, shapes, strict=True)]
+        if [its[1:] for its in found] != expected:
+            raise ValueError(
+                f"state must be what the last predict() of this policy returned, arrays of the shapes "
+                f"{[(n, *shape) for shape in expected]}, got {found}."
+            )
         return self._memory_of([th.as_tensor(part, device=self.device) for part in state])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

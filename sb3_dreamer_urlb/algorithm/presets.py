@@ -30,7 +30,10 @@ def with_presets(
         @functools.wraps(init)
         def wrapped(*args: Any, **kwargs: Any) -> None:
             args, kwargs = plain(args), plain(kwargs)
-            given = signature.bind_partial(*args, **kwargs).arguments
+            try:
+                given = signature.bind_partial(*args, **kwargs).arguments
+            except TypeError as error:
+                raise TypeError(f"{type(args[0]).__name__}: {error}") from None
             preset = find_preset(presets, given.get("preset", signature.parameters["preset"].default))
             for name, value in preset.items():
                 if left_alone is not None and left_alone(name, given):
@@ -54,6 +57,6 @@ def find_preset(presets: Presets, name: str) -> dict[str, Any]:
     :param name: what a user wrote
     :raises ValueError: for an unknown name; the message lists the known ones
     """
-    if name not in presets:
+    if not isinstance(name, str) or name not in presets:
         raise ValueError(f"Unknown preset {name!r}; known are {sorted(presets)}.")
     return presets[name]

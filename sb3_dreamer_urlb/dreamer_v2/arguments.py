@@ -14,7 +14,7 @@ from sb3_dreamer_urlb.behavior.actor_critic import ACTOR_GRADIENTS, AUTO, REINFO
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-from sb3_dreamer_urlb.number_checks import check_dict, check_integer, is_finite_number
+from sb3_dreamer_urlb.number_checks import check_choice, check_dict, check_integer, check_switch, is_finite_number
 from sb3_dreamer_urlb.planning import make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.sampling import BY_EPISODE
@@ -70,6 +70,11 @@ ASSIGNABLE = frozenset(
         "planner", "planner_kwargs", "planner_delay", "action_noise", "overlap", "verbose", "tensorboard_log",
     }
 )  # fmt: skip
+#: what networks are built with, and what decides on their training in fine-tuning
+OF_THE_NETWORKS = frozenset(
+    {"discount_head", "intrinsic_reward", "intrinsic_kwargs", "learn_task_reward", "policy_kwargs", "preset"}
+)
+BEFORE_FINE_TUNING = frozenset({"freeze_decoder"})
 #: after this many finished episodes that are all shorter than a sequence, waiting for a longer one is given up
 SHORT_EPISODES = 50
 
@@ -97,7 +102,7 @@ def check(model: SavedAlgorithm) -> None:
     if given.discount_head is not None and not isinstance(given.discount_head, bool):
         raise ValueError(f"discount_head must be True, False or None, got {given.discount_head!r}.")
     for name in ("overlap", "reward_trains_model", "freeze_decoder"):
-        checks.check_switch(name, getattr(given, name))
+        check_switch(name, getattr(given, name))
     _check_tasks(given.learn_task_reward)
     checks.check_noise(model)
     _check_names(given, model.phase)
@@ -136,10 +141,8 @@ def check_tasks_are_told(tasks: Sequence[str], env: VecEnv) -> None:
 
 def _check_names(given: SimpleNamespace, phase: str) -> None:
     checks.check_forms(given.precision, given.compile)
-    if given.actor_gradient not in (AUTO, *ACTOR_GRADIENTS):
-        raise ValueError(f"actor_gradient must be one of {(AUTO, *ACTOR_GRADIENTS)}, got {given.actor_gradient!r}.")
-    if given.warmup_actions not in WARMUPS:
-        raise ValueError(f"warmup_actions must be one of {WARMUPS}, got {given.warmup_actions!r}.")
+    check_choice("actor_gradient", given.actor_gradient, (AUTO, *ACTOR_GRADIENTS))
+    check_choice("warmup_actions", given.warmup_actions, WARMUPS)
     method = given.intrinsic_reward
     intrinsic = make_intrinsic_reward(method, given.intrinsic_kwargs)
     if intrinsic is not None:

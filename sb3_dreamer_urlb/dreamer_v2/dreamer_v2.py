@@ -120,6 +120,8 @@ class DreamerV2(AgentAlgorithm):
     }
     policy_class: type[DreamerPolicy]
     assignable = arguments.ASSIGNABLE
+    of_the_networks = arguments.OF_THE_NETWORKS
+    before_fine_tuning = arguments.BEFORE_FINE_TUNING
     policy: DreamerPolicy
     learner: Learner
     intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None

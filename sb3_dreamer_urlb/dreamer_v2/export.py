@@ -50,11 +50,15 @@ class ActingStep(nn.Module):
     It stands on the CPU, wherever the policy is, so that files run anywhere.
 
     :param policy: acts with its actor, and follows a fixed skill if any
-    :raises ValueError: if something else acts: a planner, random actions, or skills that change
+    :raises ValueError: for what is no policy of DreamerV2's, or if something else acts: a planner, random actions, or skills
+        that change
     """
 
     def __init__(self, policy: DreamerPolicy):
         super().__init__()
+        if not isinstance(policy, DreamerPolicy):
+            kind = f"{type(policy).__module__}.{type(policy).__qualname__}"
+            raise ValueError(f"ActingStep exports a policy of DreamerV2's, model.policy of a DreamerV2; got {kind}.")
         if policy.planner is not None:
             raise ValueError(
                 "The exported step acts with the actor, but this policy has a planner, which is not exported: take one "

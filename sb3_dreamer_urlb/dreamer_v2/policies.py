@@ -80,7 +80,6 @@ class DreamerPolicy(AgentPolicy[ActingState]):
     :raises ValueError: for spaces or sizes that do not fit
     """
 
-    memory_parts = 6
     agent: Agent
 
     def __init__(
@@ -293,6 +292,12 @@ class DreamerPolicy(AgentPolicy[ActingState]):
     def _memory_of(self, parts: list[th.Tensor]) -> ActingState:
         stoch, deter, action, plan, skill, steps = parts
         return ActingState(LatentState(stoch, deter), action, plan, skill, steps)
+
+    def memory_shapes(self) -> tuple[tuple[int, ...] | None, ...]:
+        rssm, skills = self.agent.world_model.rssm, self.agent.skills
+        # A plan of another horizon is begun anew.
+        size = 0 if skills is None else skills.dim
+        return (rssm.stoch_size,), (rssm.deter_size,), (self.agent.actor.action_size,), None, (size,), ()
 
 
 #: the agent for images, and what users write for it

@@ -10,7 +10,7 @@ from sb3_dreamer_urlb.algorithm import checks
 from sb3_dreamer_urlb.drq_v2.noise import check_noise_std
 from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
-from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.number_checks import check_integer, check_switch
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
@@ -37,6 +37,9 @@ ASSIGNABLE = frozenset(
         "learning_starts", "train_freq", "gradient_steps", "action_noise", "overlap", "verbose", "tensorboard_log",
     }
 )  # fmt: skip
+#: what networks are built with, and what decides on their training in fine-tuning
+OF_THE_NETWORKS = frozenset({"frame_stack", "intrinsic_reward", "intrinsic_kwargs", "policy_kwargs", "preset"})
+BEFORE_FINE_TUNING = frozenset({"freeze_encoder"})
 
 
 def check(model: SavedAlgorithm) -> None:
@@ -57,7 +60,7 @@ def check(model: SavedAlgorithm) -> None:
     checks.check_rate("learning_rate", given.learning_rate)
     check_noise_std(given.noise_std)
     for name in ("overlap", "freeze_encoder"):
-        checks.check_switch(name, getattr(given, name))
+        check_switch(name, getattr(given, name))
     checks.check_noise(model)
     checks.check_forms(given.precision, given.compile)
     make_intrinsic_reward(given.intrinsic_reward, given.intrinsic_kwargs, TransitionReward)

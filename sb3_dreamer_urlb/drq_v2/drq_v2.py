@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import VecFrameStack, is_vecenv_wrapped
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
@@ -51,7 +53,7 @@ class DrQv2(AgentAlgorithm):
     :param n_steps: n, rewards a return has before the value
     :param frame_stack: frames that the agent sees at once; None for three images, or one vector
     :param noise_std: standard deviation of the actor's noise, when it acts and when it learns; or (at first, at last, agent
-        steps in between) of each phase, as (1.0, 0.1, 250000) in the DrQ-v2 paper for tasks of medium difficulty
+        steps in between) of each phase, as (1.0, 0.1, 500000) of DrQ-v2's authors for tasks of medium difficulty
     :param noise_clip: bound of that noise when it learns
     :param freeze_encoder: the encoder learns nothing in fine-tuning
     :param intrinsic_reward: ``"disagreement"``, another registered name, a subclass or an instance of
@@ -81,6 +83,8 @@ class DrQv2(AgentAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy}
     policy_class: type[DrQPolicy]
     assignable = arguments.ASSIGNABLE
+    of_the_networks = arguments.OF_THE_NETWORKS
+    before_fine_tuning = arguments.BEFORE_FINE_TUNING
     policy: DrQPolicy
     learner: DrQLearner
     replay_buffer: NStepFrameReplayBuffer
@@ -123,7 +127,8 @@ class DrQv2(AgentAlgorithm):
         _init_setup_model: bool = True,
     ):
         super().__init__(
-            policy,
+            # By name, Stable-Baselines3 would ask for its policy of Dicts.
+            self.policy_aliases.get(policy, policy) if isinstance(policy, str) else policy,
             env,
             learning_rate,
             buffer_size=buffer_size,
@@ -164,6 +169,20 @@ class DrQv2(AgentAlgorithm):
     def _check_arguments(self) -> None:
         arguments.check(self)
 
+    def _read_env(self) -> None:
+        super()._read_env()
+        stacked = self.env is not None and is_vecenv_wrapped(self.env, VecFrameStack)
+        frames = self._frames()
+        if stacked and frames > 1:
+            warnings.warn(
+                f"The environment stacks frames (VecFrameStack), and DrQv2 stacks {frames} of these stacks, most frames "
+                "several times: leave the wrapper out, or write frame_stack=1."
+            )
+
+    def _frames(self) -> int:
+        """Frames that the agent sees at once."""
+        return self.policy_class.usual_frame_stack if self.frame_stack is None else self.frame_stack
+
     def _tell_parts(self) -> None:
         self.replay_buffer.gamma = self.gamma
 
@@ -187,6 +206,12 @@ class DrQv2(AgentAlgorithm):
         )
 
     def _new_learner(self) -> DrQLearner:
+        untrained = self.pretrained_frames == 0 and not phases.PHASES[self.phase].explores
+        if self.freeze_encoder and untrained and any(True for _ in self.policy.agent.encoder.parameters()):
+            warnings.warn(
+                "freeze_encoder=True without a pre-training: the encoder stays as it was drawn at random, unless weights are "
+                "loaded into it."
+            )
         return DrQLearner(self.policy.agent, self._learner_config())
 
     def _learner_config(self) -> DrQLearnerConfig:
@@ -202,14 +227,13 @@ class DrQv2(AgentAlgorithm):
 
     def _new_replay_buffer(self) -> NStepFrameReplayBuffer:
         buffer_class: Any = self.replay_buffer_class or NStepFrameReplayBuffer
-        frames = self.policy_class.usual_frame_stack if self.frame_stack is None else self.frame_stack
         buffer: NStepFrameReplayBuffer = buffer_class(
             self.buffer_size,
             self.observation_space,
             self.action_space,
             device=self.device,
             n_envs=self.n_envs,
-            frame_stack=frames,
+            frame_stack=self._frames(),
             n_steps=self.n_steps,
             gamma=self.gamma,
             **{"seed": self.seed, "phase": self.phase, **self.replay_buffer_kwargs},
@@ -217,6 +241,26 @@ class DrQv2(AgentAlgorithm):
         return buffer
 
     # -- phases --------------------------------------------------------------------------------------------------------
+
+    def fine_tune(
+        self,
+        env: GymEnv | None = None,
+        keep_actor: bool | None = None,
+        keep_critic: bool = False,
+        keep_reward: bool = False,
+    ) -> None:
+        """Leave pre-training: encoder, actor and the critic's trunk stay, everything else starts afresh.
+
+        The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
+
+        :param env: the fine-tuning environment; None stays in the same one
+        :param keep_actor: None keeps it, in every domain, as the benchmark does for this agent
+        :param keep_critic: keep the critic's heads, too; for ablations
+        :param keep_reward: False; this agent has no reward head to keep
+        :raises ValueError: if the model is not pre-training, ``keep_reward`` is True, or one of these is neither true nor
+            false
+        """
+        super().fine_tune(env, keep_actor, keep_critic, keep_reward)
 
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DrQPolicy)

@@ -53,7 +53,6 @@ class DrQPolicy(AgentPolicy[FrameMemory]):
     :raises ValueError: for spaces or sizes that do not fit
     """
 
-    memory_parts = 2
     #: frames that the agent sees at once where nobody says
     usual_frame_stack: ClassVar[int] = 3
 
@@ -90,6 +89,15 @@ class DrQPolicy(AgentPolicy[FrameMemory]):
         self.noise_std = noise_std
         self.intrinsic = intrinsic
         self._constructor_sizes = {**sizes, "net_arch": net_arch, "frame_stack": frame_stack}
+
+    @classmethod
+    def _observations(cls, space: spaces.Space[Any], normalize_images: bool) -> Observations:
+        if isinstance(space, spaces.Dict):
+            raise UnsupportedSpaceError(
+                f"DrQv2 takes no Dict observations, got {space}: gymnasium.wrappers.FlattenObservation makes vectors of them, "
+                "and DreamerV2's MultiInputPolicy takes them as they are."
+            )
+        return super()._observations(space, normalize_images)
 
     @classmethod
     def _actions(cls, space: spaces.Space[Any]) -> Actions:
@@ -129,6 +137,10 @@ class DrQPolicy(AgentPolicy[FrameMemory]):
 
     def _memory_of(self, parts: list[th.Tensor]) -> FrameMemory:
         return FrameMemory(*parts)
+
+    def memory_shapes(self) -> tuple[tuple[int, ...] | None, ...]:
+        assert self.observation_space.shape is not None
+        return (self.frame_stack, *self.observation_space.shape), (self.actions.size,)
 
 
 #: the agent for images, and what users write for it

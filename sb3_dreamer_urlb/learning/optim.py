@@ -60,6 +60,8 @@ class ClippedAdam:
             # Fused Adam reads raw memory: a gradient laid out channels-last would be applied to the wrong weights.
             parameter.grad = None if grad is None else grad.contiguous()
         self.reached = [parameter for parameter in self.parameters if parameter.grad is not None]
+        if not self.reached:
+            return loss.detach().new_zeros(())
         norm = nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         skips = ~(norm.isfinite() & loss.detach().isfinite())
         self.skipped = skips if self.skipped is None else self.skipped | skips
@@ -71,7 +73,19 @@ class ClippedAdam:
         self.adam.found_inf = skips.float()  # type: ignore[attr-defined]
         self.adam.step()
         self.adam.zero_grad(set_to_none=True)
+        if len(self.adam.state) < len(self.parameters):
+            self._begin_moments()
         return norm
+
+    def _begin_moments(self) -> None:
+        """Of parameters that no loss has reached yet: files hold those of all, or of none."""
+        for parameter in self.parameters:
+            if parameter not in self.adam.state:
+                self.adam.state[parameter] = {
+                    "step": th.zeros((), device=parameter.device),
+                    "exp_avg": th.zeros_like(parameter, memory_format=th.preserve_format),
+                    "exp_avg_sq": th.zeros_like(parameter, memory_format=th.preserve_format),
+                }
 
     @th.no_grad()
     def _shrink(self, steps: th.Tensor) -> None:

@@ -14,6 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import OnItsWay
 from sb3_dreamer_urlb.replay.rows import observation_of
@@ -29,7 +30,8 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
     While none is finished, the open ones are drawn as they stand, so that learning begins when it is due however long an
     episode takes. Endless ones are finished in pieces of ``max_episode_rows``.
 
-    Stacks begin anew with each episode, whose first frame fills what is missing. A return ends with its episode: with fewer
+    Stacks begin anew with each episode, whose first frame fills what is missing, and so do they with each such piece: of its
+    first frame_stack - 1 steps, the agent saw the frames before, too. A return ends with its episode: with fewer
     than n rewards, and with the value of the true last observation where the episode was truncated, without one where it
     terminated.
 
@@ -41,6 +43,8 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
     :param frame_stack: frames an observation has
     :param n_steps: n
     :param gamma: discount of a step
+    :param max_episode_rows: see above
+    :param kwargs: of :class:`~sb3_dreamer_urlb.SequenceReplayBuffer`
     """
 
     def __init__(
@@ -54,15 +58,22 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
         frame_stack: int = 3,
         n_steps: int = 3,
         gamma: float = 0.99,
+        max_episode_rows: int = 5000,
         **kwargs: Any,
     ):
         length = frame_stack + n_steps
-        super().__init__(
-            buffer_size, observation_space, action_space, device, n_envs, batch_length=length, sampling=BY_ROW, **kwargs
-        )
+        check_integer("max_episode_rows", max_episode_rows, 1)
+        for name, rows in (("buffer_size", buffer_size), ("max_episode_rows", max_episode_rows)):
+            if length > rows:
+                raise ValueError(f"{name}={rows} must not be smaller than frame_stack + n_steps, {length} rows.")
+        drawn: dict[str, Any] = {"batch_length": length, "sampling": BY_ROW, "max_episode_rows": max_episode_rows}
+        super().__init__(buffer_size, observation_space, action_space, device, n_envs, **drawn, **kwargs)
         self.frame_stack = frame_stack
         self.n_steps = n_steps
         self.gamma = gamma
+
+    def check_lengths(self, batch_length: int) -> None:
+        """Rows are stacked and summed when they are drawn: those of any other ``frame_stack`` and ``n_steps`` will do."""
 
     def can_sample(self) -> bool:
         """Whether a step was made."""

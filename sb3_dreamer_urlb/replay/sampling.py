@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_dreamer_urlb.number_checks import check_choice
+
 #: from what a sequence's start is drawn
 BY_EPISODE, BY_ROW = SAMPLINGS = ("episodes", "rows")
 #: of a sequence: number of an episode, first row, row after the last
@@ -15,8 +17,7 @@ Pieces = list[tuple[int, int, int]]
 
 def check_sampling(sampling: str) -> None:
     """:raises ValueError: for an unknown name"""
-    if sampling not in SAMPLINGS:
-        raise ValueError(f"sampling must be one of {SAMPLINGS}, got {sampling!r}.")
+    check_choice("sampling", sampling, SAMPLINGS)
 
 
 def draw(sampling: str, rng: np.random.Generator, episodes: Sequence[Any], length: int, n: int) -> Iterator[Pieces]:

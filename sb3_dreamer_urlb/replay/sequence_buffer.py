@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.envs.domain_rewards import KEY
 from sb3_dreamer_urlb.envs.env_steps import is_fault
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
 from sb3_dreamer_urlb.replay.episode import Episode
@@ -95,6 +96,9 @@ class SequenceReplayBuffer(ReplayBuffer):
     ):
         # ReplayBuffer's own constructor would allocate the whole buffer at once, in lock-step arrays.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
+        check_integer("max_episode_rows", max_episode_rows, 1)
+        if seed is not None:
+            check_integer("seed", seed, 0)
         if batch_length > min(buffer_size, max_episode_rows):
             raise ValueError(
                 f"batch_length={batch_length} must not exceed buffer_size={buffer_size} "
@@ -126,6 +130,15 @@ class SequenceReplayBuffer(ReplayBuffer):
         self._prefetcher: Prefetcher[tuple[gathering.Tensors, Mapping[str, Any]]] = Prefetcher()
         self._transfer = gathering.make_transfer(self.device if self.prefetches else None)
         self._reset_memory()
+
+    def check_lengths(self, batch_length: int) -> None:
+        """Whether the episodes of another buffer can be drawn from this one.
+
+        :param batch_length: of the other
+        :raises ValueError: if they may be too short, or those that are missing long enough
+        """
+        if batch_length != self.batch_length:
+            raise ValueError(f"the replay buffer has batch_length={batch_length}, the model {self.batch_length}")
 
     def row_bytes(self) -> int:
         """Bytes of one row."""

@@ -6,6 +6,7 @@ Not in the file: the replay (``save_replay_buffer``, or a run folder), the envir
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import torch as th
@@ -142,7 +143,10 @@ def load(
             raise ValueError(f"it has other fields than it should: {sorted(set(data) ^ FIELDS)}")
         model = _prepared(algorithm, data, wrapped, device, custom_objects or {}, kwargs)
         states = None if data["random"] is None else RandomStates(data["random"])
-        _build_checked(model, archive)
+        try:
+            _build_checked(model, archive)
+        except ValueError as error:
+            raise _naming_who(error, algorithm, archive, device, custom_objects or {}, kwargs) from None
         loaded = tensors.unpack(archive, TENSORS)
         statistics = {name: loaded.pop(name) for name in list(loaded) if name.startswith(normalization.PREFIX)}
         _put(model, loaded)
@@ -197,6 +201,37 @@ def _build_checked(model: SavedAlgorithm, archive: Archive) -> None:
     model.set_random_seed(model.seed)
     model._build()
     tensors.compare(found, _with_moments(model, expected, found))
+
+
+def _naming_who(
+    error: ValueError,
+    algorithm: type[Model],
+    archive: Archive,
+    device: th.device,
+    custom: dict[str, Any],
+    kwargs: dict[str, Any],
+) -> ValueError:
+    """The error of networks that the file's tensors do not fit; it names the arguments of the caller's that make them so.
+
+    :param error: of :func:`_build_checked`
+    """
+    given = {**custom, **kwargs}
+    must = {name: given[name] for name in needed(archive.data) if name in given}
+
+    def fits(names: Iterable[str]) -> bool:
+        chosen = {name: given[name] for name in names}
+        try:
+            _build_checked(_prepared(algorithm, archive.data, None, device, must, chosen), archive)
+        except Exception:
+            return False
+        return True
+
+    free = sorted(set(given) & set(algorithm.argument_names()) - must.keys())
+    if not free or not fits(()):
+        return error
+    blamed = [name for name in free if not fits([name])] or free
+    shown = ", ".join(f"{name}={given[name]!r}" for name in blamed)
+    return ValueError(f"its networks and optimisers were made with another {' and '.join(blamed)} than {shown}: {error}")
 
 
 def _with_moments(model: SavedAlgorithm, weights: tensors.Table, found: tensors.Table) -> tensors.Table:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
+from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
 
@@ -29,13 +31,20 @@ def save(policy: BasePolicy, target: Target) -> None:
         writer.finish({"parameters": {name: values.encode_or_describe(value) for name, value in parameters.items()}})
 
 
-def load(kind: type[Policy], source: Target, device: th.device | str, custom_objects: dict[str, Any] | None) -> Policy:
+def load(
+    kind: type[Policy],
+    source: Target,
+    device: th.device | str,
+    custom_objects: dict[str, Any] | None,
+    others: Iterable[type[Any]] = (),
+) -> Policy:
     """Read a policy.
 
     :param kind: its class
     :param source: path or binary file object
     :param device: where to put it
     :param custom_objects: constructor arguments that no file can hold
+    :param others: classes whose policy it may be, if it is none of ``kind``
     :raises SnapshotError: naming the file and why it is refused
     """
     device = get_device(device)
@@ -43,6 +52,7 @@ def load(kind: type[Policy], source: Target, device: th.device | str, custom_obj
         if set(archive.data) != {"parameters"}:
             raise ValueError("it has other fields than it should")
         parameters = {name: values.decode(value) for name, value in archive.data["parameters"].items()}
+        _check_kind(kind, parameters, others)
         parameters.update(custom_objects or {})
         for name, value in parameters.items():
             if (missing := values.contains_custom(value)) is not None:
@@ -58,6 +68,29 @@ def load(kind: type[Policy], source: Target, device: th.device | str, custom_obj
         policy: Policy = constructor(lr_schedule=_no_schedule, **parameters)
         policy.load_state_dict(tensors.unpack(archive, TENSORS))
         return policy.to(device)
+
+
+def _check_kind(kind: type[Any], parameters: dict[str, Any], others: Iterable[type[Any]]) -> None:
+    """
+    :param kind: that was asked for
+    :param parameters: of the file
+    :param others: see :func:`load`
+    :raises ValueError: if the policy is of another class
+    """
+    unknown = sorted(set(parameters) - set(named_parameters(kind)))
+    if not unknown:
+        return
+    its = [other for other in others if set(parameters) <= set(named_parameters(other)) and _takes(other, parameters)]
+    hint = f": it is one of {its[0].__module__}.{its[0].__qualname__}" if its else ""
+    raise ValueError(f"its policy has an argument {unknown[0]!r}, which {kind.__module__}.{kind.__qualname__} has not{hint}")
+
+
+def _takes(kind: Any, parameters: dict[str, Any]) -> bool:
+    try:
+        kind.check_spaces(*(parameters[name] for name in ("observation_space", "action_space", "normalize_images")))
+    except (ValueError, LookupError):
+        return False
+    return True
 
 
 def _no_schedule(_: float) -> float:

@@ -164,12 +164,11 @@ def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, A
             f"the replay buffer was filled in the phase {str(data['phase'])[:80]!r}, the model is in {buffer.phase!r}"
         )
     # Another number of environments will do: open episodes are ended, so that each begins a stream of its own.
-    if data["batch_length"] != buffer.batch_length:
-        raise ValueError(f"the replay buffer has batch_length={data['batch_length']}, the model {buffer.batch_length}")
     for name in ("observation_space", "action_space"):
         space = values.decode(data[name])
         if space != getattr(buffer, name):
             raise ValueError(f"the replay buffer's {name} is {space}, the model's {getattr(buffer, name)}")
+    buffer.check_lengths(data["batch_length"])
     return data
 
 
@@ -183,8 +182,13 @@ def _episodes(buffer: SequenceReplayBuffer, archive: Archive) -> Iterator[Episod
         tensors.compare(table, {**expected, LENGTHS: ("I64", count)})
         loaded = tensors.unpack(archive, member)
         lengths = loaded.pop(LENGTHS)
-        if int(lengths.sum()) != rows[0] or bool((lengths < 1).any()) or bool((lengths > buffer.max_episode_rows).any()):
+        if int(lengths.sum()) != rows[0] or bool((lengths < 1).any()):
             raise ValueError(f"the lengths of {member} are damaged")
+        if bool((lengths > buffer.max_episode_rows).any()):
+            raise ValueError(
+                f"it has an episode of {int(lengths.max())} rows, the model's replay takes {buffer.max_episode_rows} "
+                "(buffer_size, or max_episode_rows in replay_buffer_kwargs)"
+            )
         for part in zip(*(loaded[name].split(lengths.tolist()) for name in columns), strict=True):
             # Copies, so that an evicted episode gives its memory back.
             yield Episode.of({name: np.array(rows.numpy()) for name, rows in zip(columns, part, strict=True)})

@@ -43,6 +43,8 @@ def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
         raise ValueError(
             f"{name} must have the shape {shape}, its channels first or last, or with a leading n: got {array.shape}."
         )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {str(array.tolist())[:80]}.")
     _check_classes(name, array, space)
     # Views with negative strides (a mirrored image) are arrays that torch does not take.
     return np.ascontiguousarray(array).reshape(array.shape)

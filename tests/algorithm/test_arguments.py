@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 import torch as th
 from fake_envs import CounterEnv
+from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_dreamer_urlb import DreamerV2, DrQv2, FineTuneCallback, PhaseSwitchCallback
+from sb3_dreamer_urlb import DreamerV2, DrQv2, FineTuneCallback, PhaseSwitchCallback, SnapshotError
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import TransitionReward
@@ -127,9 +130,142 @@ def test_an_assigned_model_is_one_that_was_made_so(weights, name):
 def test_what_was_built_is_not_assigned(name):
     model = make(DrQv2)
     before = getattr(model, name)
-    with pytest.raises(AttributeError, match=rf"{name} cannot be assigned.*DrQv2.load\(path, {name}=\.\.\.\)"):
+    way = r"another model, DrQv2\(\.\.\., " if name in DrQv2.of_the_networks else r"DrQv2.load\(path, "
+    with pytest.raises(AttributeError, match=rf"{name} cannot be assigned.*{way}{name}=\.\.\.\)"):
         setattr(model, name, before)
     assert getattr(model, name) is before
+
+
+#: another value for each argument that neither can be assigned nor belongs to the networks
+LOADED = {
+    "n_steps": 2, "buffer_size": 500, "replay_buffer_class": None, "replay_buffer_kwargs": {"max_episode_rows": 50},
+    "precision": "bfloat16", "compile": "eager", "seed": 5, "stats_window_size": 7, "freeze_encoder": True,
+    "batch_length": 5, "discount_head": True, "warmup_actions": "saturated", "actor_gradient": "dynamics",
+    "reward_trains_model": False, "freeze_decoder": True,
+}  # fmt: skip
+
+
+@each
+def test_what_a_message_says_of_load_is_true(tmp_path, algorithm, policy, replay, method):
+    """Of a model that was trained, so that its optimisers have moments."""
+    make(algorithm, intrinsic_reward=method).learn(30).save(tmp_path / "model")
+    names = set(algorithm.argument_names()) - algorithm.assignable - algorithm.of_the_networks
+    assert names <= LOADED.keys()
+    for name in sorted(names):
+        model = algorithm.load(tmp_path / "model", env=CounterEnv(9), device="cpu", **{name: LOADED[name]})
+        found = getattr(model, {"stats_window_size": "_stats_window_size"}.get(name, name))
+        assert found == LOADED[name], name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "method", "name", "value"),
+    [
+        (DreamerV2, "plan2explore", "policy_kwargs", {"net_arch": [9]}),
+        (DreamerV2, "plan2explore", "intrinsic_kwargs", {"ensemble_size": 3}),
+        (DreamerV2, "plan2explore", "discount_head", False),
+        (DrQv2, "disagreement", "policy_kwargs", {"net_arch": [9]}),
+        (DrQv2, "disagreement", "intrinsic_kwargs", {"trains_encoder": False}),
+        (DrQv2, "disagreement", "frame_stack", 2),
+    ],
+)
+@pytest.mark.parametrize("custom", [False, True])
+def test_load_names_the_argument_that_the_networks_do_not_fit(tmp_path, algorithm, method, name, value, custom):
+    make(algorithm, intrinsic_reward=method).learn(30).save(tmp_path / "model")
+    given = {name: value, "gamma": 0.5}
+    with pytest.raises(SnapshotError, match=rf"made with another {name} than {name}="):
+        algorithm.load(tmp_path / "model", device="cpu", **({"custom_objects": given} if custom else given))
+
+
+# -- of any type -----------------------------------------------------------------------------------------------------------
+
+
+#: what no argument takes, in forms that comparisons, look-ups and divisions raise at
+STRANGE = [np.array([1, 2]), [object()], b"x", 1j, {1: 2}]
+#: what is left to Stable-Baselines3 and torch
+LEFT = {"self", "policy", "env", "device", "_init_setup_model"}
+NAMES = [(kind, name) for kind, *_ in KINDS for name in inspect.signature(kind).parameters if name not in LEFT]
+
+
+@pytest.mark.parametrize(("algorithm", "name"), NAMES, ids=lambda value: getattr(value, "__name__", value))
+def test_arguments_of_any_type_are_named(algorithm, name):
+    for value in STRANGE:
+        with pytest.raises(ValueError, match=name):
+            make(algorithm, **{name: value})
+
+
+@each
+@pytest.mark.parametrize("name", ["policy_kwargs", "replay_buffer_kwargs"])
+@pytest.mark.parametrize("value", [0, "", (), False, [1], np.array([1, 2])])
+def test_what_is_false_is_no_dictionary(algorithm, policy, replay, method, name, value):
+    with pytest.raises(ValueError, match=f"{name} must be a dictionary or None, got"):
+        make(algorithm, **{name: value})
+
+
+@each
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"replay_buffer_kwargs": {"seed": "a"}}, "seed must be an integer of at least 0, got 'a'"),
+        ({"replay_buffer_kwargs": {"max_episode_rows": "9"}}, "max_episode_rows must be an integer of at least 1, got '9'"),
+        ({"replay_buffer_kwargs": {"max_episode_rows": 0}}, "max_episode_rows must be an integer of at least 1, got 0"),
+        ({"policy_kwargs": {"normalize_images": "x"}}, "normalize_images must be True or False, got 'x'"),
+        ({"preset": [1]}, r"Unknown preset \[1\]"),
+    ],
+)
+def test_their_parts_are_named(algorithm, policy, replay, method, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(algorithm, **kwargs)
+
+
+@each
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        *(({"total_timesteps": value}, "total_timesteps must be a number") for value in ("5", float("nan"), None, [5], True)),
+        *(({"log_interval": value}, "log_interval must be an integer of at least 1") for value in (0, -1, "4", 2.5)),
+    ],
+)
+def test_learn_says_what_it_takes(algorithm, policy, replay, method, kwargs, message):
+    model = make(algorithm)
+    with pytest.raises(ValueError, match=message):
+        model.learn(**{"total_timesteps": 8, **kwargs})
+    assert model.num_timesteps == 0 and model.learn(4.0, log_interval=None).num_timesteps == 4
+
+
+@each
+def test_an_argument_that_it_has_not_is_named_with_its_class(algorithm, policy, replay, method):
+    with pytest.raises(TypeError, match=f"{algorithm.__name__}: got an unexpected keyword argument 'plan'"):
+        make(algorithm, plan=1)
+
+
+# -- predict ---------------------------------------------------------------------------------------------------------------
+
+
+@each
+def test_a_state_of_another_policy_is_refused(algorithm, policy, replay, method):
+    model = make(algorithm)
+    observation, _ = CounterEnv().reset()
+    _, state = model.predict(observation)
+    count = len(state)
+    for wrong, message in (
+        (state[:1], f"a tuple of {count} arrays, got a tuple of 1"),
+        (list(state), f"a tuple of {count} arrays, got list"),
+        ((state[0][..., :1], *state[1:]), "arrays of the shapes"),
+        ((state[0], np.zeros((1, 7), np.float32), *state[2:]), r"got .*\(1, 7\)"),
+        ((state[0], np.float32(1), *state[2:]), "environments"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.predict(observation, wrong)
+    model.predict(observation, state)
+
+
+@each
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_observations_that_are_not_finite_are_refused(algorithm, policy, replay, method, value):
+    space = spaces.Box(-1, 1, (3,), np.float32)
+    model = algorithm("MlpPolicy", CounterEnv(observation_space=space), preset="tiny", device="cpu")
+    with pytest.raises(ValueError, match=r"must be finite, got \[0.0, .*\]"):
+        model.predict(np.array([0, value, 0], np.float32))
 
 
 @pytest.mark.parametrize(("name", "value"), [("tau", 0), ("gamma", "x"), ("noise_std", -1), ("learning_rate", None)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import shutil
+import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -14,9 +15,10 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_dreamer_urlb import (
+    CnnPolicy,
     DreamerV2,
     DrQv2,
     FineTuneCallback,
@@ -26,6 +28,7 @@ from sb3_dreamer_urlb import (
     SnapshotCallback,
     SnapshotError,
 )
+from sb3_dreamer_urlb.dreamer_v2.export import ActingStep
 from sb3_dreamer_urlb.drq_v2.kept_parts import TRANSFER
 from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import EncodedSteps, TransitionReward, register_intrinsic_reward
@@ -73,7 +76,13 @@ def test_the_benchmarks_defaults():
         ({"frame_stack": 0}, "frame_stack must be an integer of at least 1, got 0"),
         ({"noise_std": -0.1}, "noise_std must be a non-negative number, or .*got -0.1"),
         ({"noise_std": (1.0, 0.1)}, r"noise_std .*got \(1.0, 0.1\)"),
-        ({"noise_std": (1.0, 0.1, 0)}, r"noise_std .*got \(1.0, 0.1, 0\)"),
+        ({"noise_std": (1.0, 0.1, 0)}, r"noise_std must fall within a whole number of agent steps, .*got \(1.0, 0.1, 0\)"),
+        (
+            {"noise_std": (1.0, 0.1, 10.5)},
+            r"noise_std must fall within a whole number of agent steps, .*got \(1.0, 0.1, 10.5\)",
+        ),
+        ({"noise_std": (1.0, 0.1, float("inf"))}, "noise_std must fall within a whole number of agent steps"),
+        ({"replay_buffer_kwargs": {"max_episode_rows": 5}}, r"max_episode_rows=5 must not be smaller than .* 6 rows"),
         ({"noise_std": "linear(1,0.1,5)"}, "noise_std .*got 'linear"),
         ({"noise_clip": float("nan")}, "noise_clip must lie in"),
         ({"learning_rate": -1}, "learning_rate must be a non-negative number or a schedule, got -1"),
@@ -103,6 +112,33 @@ def test_bad_arguments_are_named(kwargs, message):
 def test_dreamer_v2_says_whose_method_disagreement_is():
     with pytest.raises(ValueError, match=r"Unknown intrinsic_reward 'disagreement'.*reads encoded steps"):
         DreamerV2("CnnPolicy", CounterEnv(), preset="tiny", intrinsic_reward="disagreement")
+
+
+@pytest.mark.parametrize("policy", ["CnnPolicy", "MlpPolicy", "MultiInputPolicy", DrQPolicy])
+def test_dicts_of_observations_are_refused(policy):
+    space = spaces.Dict({"a": spaces.Box(-1, 1, (2,))})
+    with pytest.raises(ValueError, match="DrQv2 takes no Dict observations"):
+        tiny(CounterEnv(observation_space=space), policy)
+
+
+def test_a_schedule_may_be_written_in_thousands():
+    assert tiny(noise_std=(1.0, 0.1, 25e3)).policy.noise_std == 1.0
+
+
+def test_a_frozen_encoder_that_nobody_trained_is_told_of():
+    with pytest.warns(UserWarning, match="freeze_encoder=True without a pre-training"):
+        tiny(freeze_encoder=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pretrained(freeze_encoder=True).fine_tune()
+
+
+def test_stacks_of_stacks_are_told_of():
+    with pytest.warns(UserWarning, match="VecFrameStack.*frame_stack=1"):
+        tiny(VecFrameStack(vec_env(), 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tiny(VecFrameStack(vec_env(), 3), frame_stack=1)
 
 
 def test_discrete_actions_are_refused():
@@ -378,8 +414,8 @@ class Bare(Learning):
         (Bare(lambda *_: None), "critic"),
     ],
 )
-def test_the_encoder_learns_from_the_method_or_else_from_the_critic(weights, method, who):
-    """Whoever trains it: without the critic's gradient to it, it would stay in the latter cases."""
+def test_the_encoder_learns_from_the_method_or_else_from_the_critic(weights, tmp_path, method, who):
+    """And the model is saved, whichever parameters have moments."""
     model = tiny(intrinsic_reward=method, learning_starts=4)
     learner, agent = model.learner, model.policy.agent
     values_seen = []
@@ -395,6 +431,10 @@ def test_the_encoder_learns_from_the_method_or_else_from_the_critic(weights, met
         model.learn(24)
     assert any(values_seen) == (who == "critic")
     assert weights(agent.encoder) != before and learner.guard.total() == 0
+    with pytest.warns(UserWarning, match="No file can hold this model's intrinsic_reward"):
+        model.save(tmp_path / "model")
+    loaded = DrQv2.load(tmp_path / "model", env=vec_env(), device="cpu", custom_objects={"intrinsic_reward": method})
+    assert loaded.learn(8)._n_updates > model._n_updates
 
 
 def test_the_critic_trains_an_encoder_that_is_left_to_it_in_the_same_way(weights):
@@ -451,6 +491,43 @@ def test_a_file_of_the_other_algorithm_is_refused(tmp_path):
     tiny().save(tmp_path / "drq")
     with pytest.raises(SnapshotError, match="which DreamerV2 has not"):
         DreamerV2.load(tmp_path / "drq", device="cpu")
+
+
+@pytest.mark.parametrize("other", [{"n_steps": 5}, {"n_steps": 1, "frame_stack": 1}, {"frame_stack": 4, "n_steps": 2}])
+def test_a_replay_of_other_stacks_and_returns_is_taken(tmp_path, other):
+    model = tiny(vec_env(length=[4, 7])).learn(40)
+    model.save_replay_buffer(tmp_path / "replay")
+    taker = tiny(vec_env(), **other)
+    taker.load_replay_buffer(tmp_path / "replay")
+    assert taker.replay_buffer.size() == model.replay_buffer.size()
+    frames = taker.replay_buffer.sample(8).observation.shape[1]
+    assert frames == taker.policy.frame_stack and taker.learn(20)._n_updates > 0
+
+
+def test_a_replay_that_does_not_fit_says_why(tmp_path):
+    model = tiny(vec_env(length=30), n_steps=2).learn(40)
+    model.save_replay_buffer(tmp_path / "replay")
+    with pytest.raises(SnapshotError, match="the replay buffer's observation_space is"):
+        tiny(vec_env(size=20)).load_replay_buffer(tmp_path / "replay")
+    with pytest.raises(SnapshotError, match=r"an episode of 31 rows, the model's replay takes 20 \(buffer_size"):
+        tiny(vec_env(), buffer_size=20).load_replay_buffer(tmp_path / "replay")
+
+
+def test_a_policy_is_loaded_with_its_own_class(tmp_path):
+    tiny().policy.save(tmp_path / "drq")
+    dreamer = DreamerV2("CnnPolicy", CounterEnv(), preset="tiny", device="cpu")
+    dreamer.policy.save(tmp_path / "dreamer")
+    with pytest.raises(SnapshotError, match=r"it is one of sb3_dreamer_urlb\.drq_v2\.policies\.DrQPolicy"):
+        CnnPolicy.load(tmp_path / "drq")
+    with pytest.raises(SnapshotError, match=r"it is one of sb3_dreamer_urlb\.dreamer_v2\.policies\.DreamerPolicy"):
+        DrQPolicy.load(tmp_path / "dreamer")
+
+
+def test_its_policy_is_not_exported():
+    model = tiny()
+    for given in (model, model.policy):
+        with pytest.raises(ValueError, match="ActingStep exports a policy of DreamerV2's"):
+            ActingStep(given)
 
 
 @pytest.mark.parametrize("intrinsic", [None, "disagreement"])
