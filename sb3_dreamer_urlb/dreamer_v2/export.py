@@ -185,12 +185,20 @@ def _example_of(space: spaces.Space[Any], n: int) -> th.Tensor:
     return th.as_tensor(np.stack([value.astype(space.dtype)] * n))
 
 
+def _check_step(step: ActingStep) -> None:
+    """:raises ValueError: for a model or a policy in its place"""
+    if not isinstance(step, ActingStep):
+        raise ValueError(f"step must be an ActingStep(model.policy) of a DreamerV2, got {type(step).__qualname__}.")
+
+
 def to_torchscript(step: ActingStep, path: str | os.PathLike[str]) -> None:
     """Write a step for ``torch.jit.load``, in Python or C++.
 
     :param step: what to write
     :param path: of the file, taken as it is
+    :raises ValueError: for anything else
     """
+    _check_step(step)
     with th.no_grad(), warnings.catch_warnings():
         # Branches on sizes choose the fastest of equal ways; and torch says that it will one day write another format.
         warnings.simplefilter("ignore", th.jit.TracerWarning)  # type: ignore[attr-defined]
@@ -204,7 +212,9 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     :param step: what to write
     :param path: of the file, taken as it is
     :raises ImportError: without the extra ``export``
+    :raises ValueError: for anything else
     """
+    _check_step(step)
     if missing := [name for name in ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
         raise ImportError(f"Writing ONNX needs {' and '.join(missing)}; {how_to_install('export')}.")
     example = step.example()

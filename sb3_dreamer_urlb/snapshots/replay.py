@@ -159,15 +159,15 @@ def _checked_data(buffer: SequenceReplayBuffer, archive: Archive) -> dict[str, A
     streams = data["streams"]
     if not isinstance(streams, list) or len(streams) > data["n_envs"]:
         raise ValueError("its list of open episodes is damaged")
-    if data["phase"] != buffer.phase:
-        raise ValueError(
-            f"the replay buffer was filled in the phase {str(data['phase'])[:80]!r}, the model is in {buffer.phase!r}"
-        )
     # Another number of environments will do: open episodes are ended, so that each begins a stream of its own.
     for name in ("observation_space", "action_space"):
         space = values.decode(data[name])
         if space != getattr(buffer, name):
             raise ValueError(f"the replay buffer's {name} is {space}, the model's {getattr(buffer, name)}")
+    if data["phase"] != buffer.phase:
+        raise ValueError(
+            f"the replay buffer was filled in the phase {str(data['phase'])[:80]!r}, the model is in {buffer.phase!r}"
+        )
     buffer.check_lengths(data["batch_length"])
     return data
 

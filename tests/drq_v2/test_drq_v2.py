@@ -28,7 +28,7 @@ from sb3_dreamer_urlb import (
     SnapshotCallback,
     SnapshotError,
 )
-from sb3_dreamer_urlb.dreamer_v2.export import ActingStep
+from sb3_dreamer_urlb.dreamer_v2.export import ActingStep, to_onnx, to_torchscript
 from sb3_dreamer_urlb.drq_v2.kept_parts import TRANSFER
 from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import EncodedSteps, TransitionReward, register_intrinsic_reward
@@ -523,11 +523,14 @@ def test_a_policy_is_loaded_with_its_own_class(tmp_path):
         DrQPolicy.load(tmp_path / "dreamer")
 
 
-def test_its_policy_is_not_exported():
+def test_its_policy_is_not_exported(tmp_path):
     model = tiny()
     for given in (model, model.policy):
         with pytest.raises(ValueError, match="ActingStep exports a policy of DreamerV2's"):
             ActingStep(given)
+        for write in (to_torchscript, to_onnx):
+            with pytest.raises(ValueError, match=r"step must be an ActingStep\(model.policy\)"):
+                write(given, tmp_path / "file")
 
 
 @pytest.mark.parametrize("intrinsic", [None, "disagreement"])
