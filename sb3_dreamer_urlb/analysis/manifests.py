@@ -157,10 +157,10 @@ def modules(plan: Plan) -> Iterator[FineTuning]:
 
 
 def longer(plan: Plan) -> Iterator[FineTuning]:
-    """Paper, appendix on longer pre-training: fine-tuning from each of its snapshots."""
+    """Paper, appendix on longer pre-training: fine-tuning from each of its snapshots with the full method."""
     for start, domain, name in plan.each():
         for length in start.lengths:
-            yield FineTuning(start, length, env_id(domain, name), plan.finetune, keeps_actor(domain))
+            yield FineTuning(start, length, env_id(domain, name), plan.finetune, keeps_actor(domain), planner="dyna_mpc")
 
 
 def sparsity(plan: Plan) -> Iterator[FineTuning]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.style import Picture
     from sb3_dreamer_urlb.evaluation.tables import Table
 
+TABLES = ("summary", "raw_scores", "improvement", "correlation")
 HELP = "turn rows of evaluations into the paper's tables and figures"
 
 
@@ -48,9 +50,10 @@ def run(options: dict[str, Any]) -> int:
     :raises ValueError: for rows about unknown things, or none
     :raises ImportError: if the extra ``plots`` is not installed
     """
-    from sb3_dreamer_urlb.evaluation.aggregate import check_rliable_installed
+    from sb3_dreamer_urlb.evaluation.aggregate import LATE, NEAR, check_rliable_installed
     from sb3_dreamer_urlb.evaluation.arms import Study
     from sb3_dreamer_urlb.evaluation.curves import selected
+    from sb3_dreamer_urlb.evaluation.names import UnknownName, counted
     from sb3_dreamer_urlb.evaluation.rows import frames, read_rows
     from sb3_dreamer_urlb.evaluation.style import check_matplotlib_installed
     from sb3_dreamer_urlb.number_checks import check_integer
@@ -58,7 +61,12 @@ def run(options: dict[str, Any]) -> int:
     check_matplotlib_installed()
     check_rliable_installed()
     check_integer("--repetitions", options["repetitions"], 1)
-    read = read_rows(*options["rows"], methods=options["also_method"], tasks=options["also_task"])
+    if options["out"].exists() and not options["out"].is_dir():
+        raise ValueError(f"--out {options['out']} is a file: give a folder.")
+    try:
+        read = read_rows(*options["rows"], methods=options["also_method"], tasks=options["also_task"])
+    except UnknownName as error:
+        raise ValueError(f"{error}{_way_out(str(error))}") from error
     if read.report():
         print(read.report(), file=sys.stderr)
     rows: list[Row] = read.rows
@@ -66,22 +74,61 @@ def run(options: dict[str, Any]) -> int:
         rows = list(selected(rows, " ".join(options["where"])).rows)
     if not rows:
         raise ValueError(f"{', '.join(map(str, options['rows']))}: no rows.")
-    budgets = {
-        name: frames(f"--{name}-frames", options[f"{name}_frames"])
-        for name in ("finetune", "pretrain")
-        if f"{name}_frames" in options
-    }
+    budgets = {}
+    for name in ("finetune", "pretrain"):
+        if (text := options.get(f"{name}_frames")) is not None:
+            budgets[name] = frames(f"--{name}-frames", text)
+            check_integer(f"--{name}-frames", budgets[name], 1)
     study = Study(rows, **budgets, normalizer=options["normalizer"])
     for warning in study.mixtures():
         print(f"These are averaged: {warning}", file=sys.stderr)
     if study.unfinished:
-        print(f"{len(study.unfinished)} runs ended before {study.finetune} frames and are left out:", file=sys.stderr)
+        runs = counted(len(study.unfinished), "run has", "runs have")
+        where = f"from {NEAR:.0%} before {study.finetune} frames to {LATE:.0%} past them"
+        print(f"{runs} no evaluation {where}, left out:", file=sys.stderr)
         for row in study.unfinished:
             print(f"  {row}", file=sys.stderr)
     options["out"].mkdir(parents=True, exist_ok=True)
     tables, pictures, missing = _made(study, options)
-    _write(tables, pictures, missing, options["out"])
+    _say_what_is_shown_nowhere(study)
+    written = _write(tables, pictures, missing, options["out"])
+    _name_older_files(options["out"], written)
     return 0
+
+
+def _way_out(message: str) -> str:
+    for word in ("method", "task"):
+        if f"unknown {word}" in message:
+            return f"; --also-{word} NAME lets others in"
+    return ""
+
+
+def _say_what_is_shown_nowhere(study: Study) -> None:
+    """Rows that fit no arm, by what they are: somebody may have meant them for one."""
+    from sb3_dreamer_urlb.evaluation.names import counted
+
+    kinds = Counter(", ".join(f"{name}={text}" for name, text in row.setting("seed", "task")) for row in study.left_out())
+    if kinds:
+        rows = counted(sum(kinds.values()), "row fits", "rows fit")
+        print(f"{rows} no table or figure and are shown nowhere (--curves shows any):", file=sys.stderr)
+        for kind, number in kinds.most_common():
+            print(f"  {number} with {kind}", file=sys.stderr)
+
+
+def _name_older_files(out: Path, written: set[str]) -> None:
+    """Results of other rows in the same folder would be taken for these."""
+    from sb3_dreamer_urlb.evaluation.paper_figures import FIGURES
+
+    ours = {*TABLES, *(draw.__name__ for draw in FIGURES)}
+    old = sorted(
+        path.name
+        for path in out.iterdir()
+        if path.suffix in (".pdf", ".png", ".md", ".csv", ".tex")
+        and (path.stem in ours or path.stem.startswith("learning_curves"))
+        and path.name not in written
+    )
+    if old:
+        print(f"Older files in {out} that these rows did not make: {', '.join(old)}.", file=sys.stderr)
 
 
 def _made(study: Study, options: dict[str, Any]) -> tuple[list[Table], list[Picture], list[str]]:
@@ -108,20 +155,24 @@ def _made(study: Study, options: dict[str, Any]) -> tuple[list[Table], list[Pict
             pictures.append(picture)
     for i, texts in enumerate(options.get("curves", ())):
         arms = [selected(study.rows, text) for text in texts]
+        study.show(arms)
         name = "learning_curves" + (f"_{i + 1}" if i else "")
         pictures.append(learning_curves(arms, study.normalizer, study.synthetic, name))
     return tables, pictures, missing
 
 
-def _write(tables: list[Table], pictures: list[Picture], missing: list[str], out: Path) -> None:
+def _write(tables: list[Table], pictures: list[Picture], missing: list[str], out: Path) -> set[str]:
+    """The names of the files."""
+    written = {"captions.md"}
     for table in tables:
-        table.write(out)
+        written.update(path.name for path in table.write(out))
         print(f"{table.text()}\n")
     captions = []
     for picture in pictures:
-        picture.write(out)
+        written.update(path.name for path in picture.write(out))
         captions.append(f"**{picture.name}**: {picture.caption}\n")
     (out / "captions.md").write_text("\n".join(captions), encoding="utf-8")
     print(f"In {out}: {', '.join([*(table.name for table in tables), *(picture.name for picture in pictures)])}.")
     if missing:
         print(f"No rows for: {', '.join(missing)}.")
+    return written

@@ -26,7 +26,7 @@ def run(options: dict[str, Any]) -> int:
     :raises ValueError: for a model without an intrinsic reward, or too few trajectories
     :raises FileNotFoundError: if there is no such snapshot, folder or file
     """
-    from sb3_dreamer_urlb.analysis.annotate import INTRINSIC_REWARD, about, annotate
+    from sb3_dreamer_urlb.analysis.annotate import FROM_ONE_PRETRAINING, INTRINSIC_REWARD, about, annotate
     from sb3_dreamer_urlb.analysis.novelty import check_has_intrinsic_reward, intrinsic_reward_on
     from sb3_dreamer_urlb.cli.agents import load_agent
 
@@ -36,7 +36,8 @@ def run(options: dict[str, Any]) -> int:
         values = intrinsic_reward_on(model, trajectories_of(options), options["seed"])
         mean = print_values(f"Intrinsic reward of {model.intrinsic_reward}", values)
         if "rows" in options:
-            count = annotate(options["rows"], about(model, env, tuned=True), INTRINSIC_REWARD, mean)
+            matches = about(model, env, tuned=True)
+            count = annotate(options["rows"], matches, INTRINSIC_REWARD, mean, FROM_ONE_PRETRAINING)
             print(f"  column {INTRINSIC_REWARD} of {count} rows of {options['rows']}")
     finally:
         env.close()

@@ -20,8 +20,8 @@ from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M, normalized_score
 from sb3_dreamer_urlb.version import how_to_install
 
 MISSING_RLIABLE = f"Interquartile means and intervals need rliable; {how_to_install('plots')}."
-#: of a run's budget of frames: so near is at its end (the last evaluation may come a few steps late or early)
-NEAR = 0.05
+#: shares of a budget of frames: the evaluation that counts comes so early at most (a few steps), and so late (an interval)
+NEAR, LATE = 0.05, 0.25
 REPETITIONS, SIZE = 2000, 0.95
 
 #: ``<domain>-<task>`` → the score (or return) of each seed
@@ -55,21 +55,28 @@ NOTHING = Estimate(math.nan)
 
 
 def final_rows(rows: Iterable[Row], frames: int) -> tuple[list[Row], list[Row]]:
-    """The last evaluation of every run within a budget of fine-tuning frames (paper §4: the score is the last).
+    """The evaluation of every run at a budget of fine-tuning frames (paper §4: the score is the last).
+
+    It is the one nearest to the budget, from 5 % before it to 25 % past it: a run that is evaluated at 90k and 110k frames has
+    used up 100k, and what it scored at 110k counts.
 
     :param rows: of any number of runs
     :param frames: the budget
-    :return: one row of each run that used the budget up, and the last ones of those that did not
+    :return: one row of each run that has one there, and of those that have none the last row before, or else the first after
     """
-    last: dict[Any, Row] = {}
+    nearest: dict[Any, Row] = {}
+
+    def distance(row: Row) -> tuple[bool, bool, int, bool]:
+        off = row.finetune_frames - frames
+        there = -NEAR * frames <= off <= LATE * frames
+        return not there, off > 0 and not there, abs(off), off < 0
+
     for row in rows:
-        if row.finetune_frames > frames * (1 + NEAR):
-            continue
-        run = tuple(part for part in row.key if part[0] != "finetune_frames")
-        if run not in last or row.finetune_frames > last[run].finetune_frames:
-            last[run] = row
-    done = [row for row in last.values() if row.finetune_frames >= frames * (1 - NEAR)]
-    return done, [row for row in last.values() if row.finetune_frames < frames * (1 - NEAR)]
+        run = row.setting("finetune_frames")
+        if run not in nearest or distance(row) < distance(nearest[run]):
+            nearest[run] = row
+    done = [row for row in nearest.values() if not distance(row)[0]]
+    return done, [row for row in nearest.values() if distance(row)[0]]
 
 
 def scores_of(rows: Iterable[Row], normalizer: str | None = DREAMER_2M) -> dict[str, list[float]]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from sb3_dreamer_urlb.evaluation.aggregate import Estimate, mean_and_error
 from sb3_dreamer_urlb.evaluation.arms import Arm, Study, acts, any_task, kept, plans, scratch
-from sb3_dreamer_urlb.evaluation.figure_parts import after, is_method, normalized, seeds, split_by
+from sb3_dreamer_urlb.evaluation.figure_parts import after, is_method, normalized, seeds, split_by, unscored
 from sb3_dreamer_urlb.evaluation.names import LEVELS, method
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, bars, finish, frames_label, new_figure
@@ -31,6 +31,7 @@ def perturbed(study: Study) -> Picture | None:
         for label, planner in ((method(name).label, acts), (f"{method(name).label} + Dyna-MPC", plans)):
             arms.append(study.pretrained(label, any_task, changed, planner, is_method(name)))
     arms = [arm for arm in arms if arm.rows]
+    study.show(arms)
     figure, panels = new_figure(len(tasks), PAGE if len(tasks) > 1 else COLUMN * 1.3)
     handles: list[Any] = []
     for axes, (domain, task) in zip(panels, tasks, strict=True):
@@ -59,6 +60,9 @@ def sparsity(study: Study) -> Picture | None:
         study.pretrained(label, any_task, acts, kept(actor, False), _jaco, lambda row: row.method in methods)
         for label, actor in (("model", False), ("model + actor", True))
     ]
+    without = unscored(arms)
+    arms = [arm.scored() for arm in arms]
+    study.show(arms)
     kinds = {"sparser": "sparse", "as in URLB": "", "denser": "dense"}
     figure, [axes] = new_figure(1, COLUMN * 1.3)
     series = {
@@ -72,7 +76,7 @@ def sparsity(study: Study) -> Picture | None:
     axes.set(ylabel="normalised score (%)", title="Sparsity of the Jaco tasks")
     caption = (
         f"Jaco reaching with a smaller and a larger rewarded area, {after(study)}; all methods together. "
-        f"{normalized(study)}, mean over tasks ± standard error; {seeds(split_by(arms, 'variant'))}."
+        f"{normalized(study)}, mean over tasks ± standard error; {seeds(split_by(arms, 'variant'))}.{without}"
     )
     return finish("sparsity", figure, caption, study.synthetic, handles)
 

@@ -23,12 +23,18 @@ def normalized(study: Study) -> str:
 
 
 def seeds(arms: Sequence[Arm]) -> str:
-    """How many seeds a method has of a task, over all arms."""
+    """How many seeds a method has of a task, over all arms; of exactly the rows that a figure shows."""
     numbers = [count for arm in arms for count in Counter((row.method, row.domain, row.task) for row in arm.rows).values()]
     if not numbers:
         return "no runs"
     low, high = min(numbers), max(numbers)
     return f"{low} seed{'s' if low > 1 else ''} a task" if low == high else f"{low} to {high} seeds a task"
+
+
+def unscored(arms: Sequence[Arm]) -> str:
+    """What a caption of scores says about the tasks that have none."""
+    names = sorted({task for arm in arms for task in arm.unscored_tasks()})
+    return f" Left out, as no reference score is known: {', '.join(names)}." if names else ""
 
 
 def after(study: Study, pretrain: bool = True) -> str:
@@ -52,11 +58,14 @@ def split_by(arms: Sequence[Arm], column: str) -> list[Arm]:
 
 
 def domain_bars(study: Study, name: str, arms: Sequence[Arm], title: str, caption: str, width: float = PAGE) -> Picture | None:
+    without = unscored(arms)
+    arms = [arm.scored() for arm in arms]
     if not any(arm.rows for arm in arms):
         return None
+    study.show(arms)
     figure, [axes] = new_figure(1, width)
     series = {arm.label: by_domain(study, arm) for arm in arms}
     handles = bars(axes, list(DOMAINS), series, list(TASKS_OF.values()))
     axes.set(ylabel="normalised score (%)", title=title)
-    text = f"{caption} {normalized(study)}, mean over tasks ± standard error; {seeds([arm for arm in arms if arm.rows])}."
+    text = f"{caption} {normalized(study)}, mean over tasks ± standard error; {seeds(arms)}.{without}"
     return finish(name, figure, text, study.synthetic, handles, 4 if width > COLUMN else 2)

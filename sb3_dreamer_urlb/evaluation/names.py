@@ -99,6 +99,16 @@ def task_name(domain: str, task: str, also: Iterable[str] = ()) -> str:
     return name
 
 
+def counted(number: int, one: str, many: str | None = None) -> str:
+    """``1 episode``, ``2 episodes``.
+
+    :param number: of things
+    :param one: what one of them is called
+    :param many: and several, with an s if None
+    """
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
 _ID = re.compile(r"(?P<family>urlb|rwrl)/(?P<domain>[a-z]+)-(?P<task>[a-z_]+)(?:-(?P<change>[a-z]+))?-v\d+")
 
 

@@ -49,6 +49,7 @@ def summary(study: Study, repetitions: int = REPETITIONS) -> Table:
         ],
     )
     stated = published_scores()
+    study.show(arm.scored() for arm in study.approaches())
     for arm in study.approaches():
         scores = arm.scores(study.normalizer)
         overall = mean_and_error(scores)
@@ -56,7 +57,7 @@ def summary(study: Study, repetitions: int = REPETITIONS) -> Table:
         table.lines.append(
             [
                 arm.label,
-                "/".join(sorted({frames_label(row.pretrain_frames) for row in arm.rows})),
+                "/".join(sorted({frames_label(row.pretrain_frames) for row in (arm.scored().rows or arm.rows)})),
                 *(percent(mean_and_error(of_domain(scores, domain))) for domain in list(DOMAINS.values())[1:]),
                 percent(overall),
                 *([with_interval(iqm(scores, repetitions))] if repetitions else []),
@@ -71,6 +72,7 @@ def summary(study: Study, repetitions: int = REPETITIONS) -> Table:
 def raw_scores(study: Study) -> Table:
     """Paper, appendix A: return of every task, beside the published references."""
     arms = study.approaches()
+    study.show(arms)
     table = Table(
         "raw_scores",
         f"Undiscounted return after {frames_label(study.finetune)} frames of fine-tuning, mean ± standard error of the seeds; "
@@ -125,6 +127,7 @@ def reward_correlation(study: Study) -> Table | None:
     )
     for name in study.methods:
         arm = study.pretrained("", acts, task_aware, _measured(name))
+        study.show([arm.scored()])
         scores = arm.scores(study.normalizer)
         rewards: dict[str, list[float]] = {}
         for row in arm.rows:

@@ -14,6 +14,13 @@ DESCRIBING = frozenset(
     ("algorithm_version", "commit", "device", "evaluation_seed", "intrinsic_reward", "ldd", "machine", "note", "returns")
     + ("run_folder", "snapshot", "source", "versions", "written")
 )
+#: columns of numbers that were measured beside the return
+NUMBERS = ("ldd", "intrinsic_reward")
+#: further columns of words in which upper and lower case mean the same
+WORDS = ("observation", "perturbation", "variant", "adaptation")
+#: further columns that are true, false or empty; ``false`` and empty mean the same
+FLAGS = ("known_reward", "synthetic")
+TRUE, FALSE = ("true", "1", "yes"), ("false", "0", "no", "none", "")
 #: what was measured; ``seconds`` may differ between two evaluations that agree
 RESULT = ("return_mean", "return_std", "episodes")
 #: last column of files that this package writes: when the row was written. Its form tells whole rows from cut ones.
@@ -59,6 +66,11 @@ class Row:
     seconds: float = math.nan
     further: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        # One spelling of each word, so that the same run has the same key whoever wrote it.
+        object.__setattr__(self, "planner", (self.planner or NONE).strip().lower())
+        object.__setattr__(self, "further", {name: _spelled(name, text) for name, text in self.further.items()})
+
     def __getitem__(self, column: str) -> Any:
         """Value of any column; ``""`` for a further one that the row does not have."""
         return getattr(self, column) if column in REQUIRED else self.further.get(column, "")
@@ -68,7 +80,14 @@ class Row:
         """What tells runs apart: every column but what was measured and how it came about."""
         measured = {*RESULT, "seconds", *DESCRIBING}
         own = {name: text for name, text in texts(self).items() if name not in measured and text != ""}
-        return tuple(sorted(own.items()))
+        return tuple(sorted((name, text) for name, text in own.items() if name not in FLAGS or text != "false"))
+
+    def setting(self, *varied: str) -> tuple[tuple[str, str], ...]:
+        """The key of what is compared: whoever pairs rows or averages them asks for this, so that nothing is forgotten.
+
+        :param varied: columns in which the compared rows may differ, such as ``seed``
+        """
+        return tuple(part for part in self.key if part[0] not in varied)
 
     def agrees(self, other: Row) -> bool:
         """Whether both measured the same, but for the last digits."""
@@ -97,6 +116,13 @@ def texts(row: Row) -> dict[str, str]:
             raise ValueError(f"column {name!r}: expected a word")
         written[name] = _text(name, value)
     return written
+
+
+def _spelled(name: str, text: Any) -> Any:
+    if name not in (*WORDS, *FLAGS):
+        return text
+    plain = str(text).strip().lower()
+    return "true" if name in FLAGS and plain in TRUE else "false" if name in FLAGS and plain in FALSE[:-1] else plain
 
 
 def _text(name: str, value: Any) -> str:

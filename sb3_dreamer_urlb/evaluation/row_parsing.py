@@ -8,12 +8,15 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from sb3_dreamer_urlb.evaluation.names import UnknownName, method_name, task_name
-from sb3_dreamer_urlb.evaluation.row import NONE, REQUIRED, WRITTEN, Row
+from sb3_dreamer_urlb.evaluation.row import FALSE, FLAGS, NONE, NUMBERS, REQUIRED, TRUE, WRITTEN, Row
 
 _WRITTEN_FORM = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ|")
-_TRUE, _FALSE = ("true", "1", "yes"), ("false", "0", "no")
-_FRAMES = re.compile(r"(?P<number>[+-]?\d+(?:\.\d*)?(?:[eE][+]?\d+)?)\s*(?P<scale>[kKmM]?)\s*(?P<unit>[A-Za-z_ ]*)")
+_FRAMES = re.compile(r"(?P<number>[+-]?[0-9]+(?:\.[0-9]*)?(?:[eE][+]?[0-9]+)?)\s*(?P<scale>[kKmM]?)\s*(?P<unit>[A-Za-z_ ]*)")
 _SCALE = {"": 1, "k": 1_000, "m": 1_000_000}
+_INTEGER = re.compile(r"\s*(-?[0-9]+)(?:\.0*)?\s*")
+_NUMBER = re.compile(r"\s*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?\s*")
+#: beyond this a number is a mistake; seeds may be as large as generators take them
+MOST, MOST_SEED = 10**12, 2**64 - 1
 
 
 def parse(values: dict[str, str], methods: Iterable[str] = (), tasks: Iterable[str] = (), strict: bool = True) -> Row:
@@ -33,11 +36,16 @@ def parse(values: dict[str, str], methods: Iterable[str] = (), tasks: Iterable[s
         raise UnknownName(f"unknown unit {unit!r} of frames; expected environment frames")
     if next(reversed(values)) == WRITTEN and not _WRITTEN_FORM.fullmatch(values[WRITTEN]):
         raise ValueError(f"{WRITTEN}={values[WRITTEN]!r} is cut off")
+    for name, text in further.items():
+        if name in NUMBERS:
+            _number(name, text)
+        elif name in FLAGS and text.strip().lower() not in (*TRUE, *FALSE):
+            raise ValueError(f"{name}={text!r}: expected true, false or nothing")
     row = Row(
         method=values["method"].strip(),
         domain=domain,
         task=task,
-        seed=_integer("seed", values["seed"], 0),
+        seed=_integer("seed", values["seed"], 0, MOST_SEED),
         pretrain_frames=frames("pretrain_frames", values["pretrain_frames"]),
         finetune_frames=frames("finetune_frames", values["finetune_frames"]),
         keep_actor=_truth("keep_actor", values["keep_actor"]),
@@ -45,9 +53,9 @@ def parse(values: dict[str, str], methods: Iterable[str] = (), tasks: Iterable[s
         planner=values["planner"].strip() or NONE,
         preset=values["preset"].strip(),
         return_mean=_number("return_mean", values["return_mean"]),
-        return_std=_number("return_std", values["return_std"], optional=True),
-        episodes=_integer("episodes", values["episodes"], 1),
-        seconds=_number("seconds", values["seconds"], optional=True),
+        return_std=_number("return_std", values["return_std"], least=0),
+        episodes=_integer("episodes", values["episodes"], 1, MOST),
+        seconds=_number("seconds", values["seconds"], least=0),
         further=further,
     )
     # Last: what is cut off may be half a name.
@@ -62,34 +70,40 @@ def frames(name: str, text: str) -> int:
     :param name: of the column, for the message
     :param text: in the file
     :raises UnknownName: for another unit
-    :raises ValueError: for what is no whole number, or negative
+    :raises ValueError: for what is no whole number, negative, or more than anybody has
     """
     found = _FRAMES.fullmatch(text.strip())
     if found is None:
-        raise ValueError(f"{name}={text!r} is no number of frames")
+        raise ValueError(f"{name}={shown(text)} is no number of frames")
     if found["unit"].strip().lower() not in ("", "frame", "frames"):
         raise UnknownName(f"{name}={text!r}: unknown unit {found['unit'].strip()!r}; expected environment frames")
     number = float(found["number"]) * _SCALE[found["scale"].lower()]
-    if number < 0 or not math.isfinite(number) or abs(number - round(number)) > 1e-6:
-        raise ValueError(f"{name}={text!r}: expected a whole number of frames, at least 0")
+    if not 0 <= number <= MOST or abs(number - round(number)) > 1e-6:
+        raise ValueError(f"{name}={shown(text)}: expected a whole number of frames, at least 0 and at most {MOST:.0e}")
     return round(number)
 
 
-def _integer(name: str, text: str, least: int) -> int:
-    if not re.fullmatch(r"\s*-?\d+(?:\.0*)?\s*", text) or int(float(text)) < least:
-        raise ValueError(f"{name}={text!r}: expected a whole number of at least {least}")
-    return int(float(text))
+def _integer(name: str, text: str, least: int, most: int) -> int:
+    # Never by way of a float: it holds no seed beyond 2^53.
+    found = _INTEGER.fullmatch(text) if len(text) < 100 else None
+    if found is None or not least <= int(found[1]) <= most:
+        raise ValueError(f"{name}={shown(text)}: expected a whole number of at least {least} and at most {most}")
+    return int(found[1])
 
 
-def _number(name: str, text: str, optional: bool = False) -> float:
-    if optional and text.strip().lower() in ("", "nan"):
+def _number(name: str, text: str, least: float | None = None) -> float:
+    """
+    :param name: of the column
+    :param text: in the file
+    :param least: the smallest that makes sense; such a number may be missing, too
+    """
+    if least is not None and text.strip().lower() in ("", "nan"):
         return math.nan
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{name}={text!r}: expected a finite number")
+    number = float(text) if _NUMBER.fullmatch(text) else math.nan
+    if not -MOST <= number <= MOST:
+        raise ValueError(f"{name}={shown(text)}: expected a finite number, at most {MOST:.0e}")
+    if least is not None and number < least:
+        raise ValueError(f"{name}={shown(text)}: expected a number of at least {least:g}")
     return number
 
 
@@ -97,6 +111,11 @@ def _truth(name: str, text: str) -> bool | None:
     plain = text.strip().lower()
     if plain in ("", NONE):
         return None
-    if plain not in _TRUE + _FALSE:
-        raise ValueError(f"{name}={text!r}: expected true, false or nothing")
-    return plain in _TRUE
+    if plain not in TRUE + FALSE:
+        raise ValueError(f"{name}={shown(text)}: expected true, false or nothing")
+    return plain in TRUE
+
+
+def shown(text: str) -> str:
+    """What stands in a file, for a message: never more than a line."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")

@@ -9,11 +9,12 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sb3_dreamer_urlb.evaluation.names import UnknownName
+from sb3_dreamer_urlb.evaluation.names import UnknownName, counted
 from sb3_dreamer_urlb.evaluation.row import DESCRIBING, NONE, REQUIRED, RESULT, WRITTEN, Row, texts
 from sb3_dreamer_urlb.evaluation.row_parsing import frames, parse
 
@@ -54,14 +55,15 @@ class Rows:
         """What a reader should know before trusting the rows, in lines; empty if all is well."""
         lines = []
         if self.skipped:
-            lines += [f"{len(self.skipped)} rows skipped:", *(f"  {reason}" for reason in self.skipped)]
+            lines += [f"{counted(len(self.skipped), 'row')} skipped:", *(f"  {reason}" for reason in self.skipped)]
         if self.disagreements:
             lines += [
-                f"{len(self.disagreements)} rows disagree with an earlier one about the same run; the later one counts:",
+                f"{counted(len(self.disagreements), 'row disagrees', 'rows disagree')} with an earlier one about the same "
+                "run; the later one counts:",
                 *(f"  {pair}" for pair in self.disagreements),
             ]
         if self.duplicates:
-            lines.append(f"{self.duplicates} rows stand there more than once and count once.")
+            lines.append(f"{counted(self.duplicates, 'further copy', 'further copies')} of rows: each row counts once.")
         return "\n".join(lines)
 
 
@@ -122,7 +124,7 @@ def lines_of(content: bytes, errors: str) -> list[str]:
     :param errors: what becomes of bytes that are no UTF-8, as ``bytes.decode`` takes it
     """
     # Not splitlines, which also splits where a text has a form feed.
-    return [line.removesuffix("\r") for line in content.decode("utf-8-sig", errors).split("\n")]
+    return re.split("\r\n|\n|\r", content.decode("utf-8-sig", errors))
 
 
 def header(line: str, path: str | os.PathLike[str]) -> list[str]:

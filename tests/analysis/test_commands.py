@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from counter_task import ENV, STATES
@@ -10,10 +12,13 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.__main__ import main
-from sb3_dreamer_urlb.analysis.annotate import annotate
+from sb3_dreamer_urlb.analysis.annotate import FROM_ONE_PRETRAINING, about, annotate
 from sb3_dreamer_urlb.analysis.discrepancy import latent_dynamics_discrepancy
 from sb3_dreamer_urlb.analysis.novelty import intrinsic_reward_on
 from sb3_dreamer_urlb.analysis.trajectories import load_trajectories
+from sb3_dreamer_urlb.evaluation.agent_rows import row_of
+from sb3_dreamer_urlb.evaluation.append import append_rows
+from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 from sb3_dreamer_urlb.hub import load_vec_normalize, save_vec_normalize
 
@@ -94,6 +99,38 @@ def test_neither_oracle_nor_folder(snapshots, tuned, capsys):
 def test_options_that_ask_for_nothing(snapshots, capsys):
     assert main(["zero-shot", str(snapshots()), "--env", ENV, "--freeze-decoder", *SMALL]) == 2
     assert "need --finetune-frames" in capsys.readouterr().err
+
+
+def test_only_the_rows_of_this_agent_are_written_to(snapshots, tuned, tmp_path):
+    """Of one seed and one length, agents that kept other modules, or of another preset or observation, stay as they are."""
+    model = DreamerV2.load(tuned, env=make_vec_env(ENV, 1), device="cpu")
+    row = row_of(model, model.get_env(), run_evaluation(model, model.get_env(), 1))
+    others = [
+        replace(row, keep_actor=not row.keep_actor),
+        replace(row, keep_critic=not row.keep_critic),
+        replace(row, planner="dyna_mpc"),
+        replace(row, preset="paper"),
+        *(replace(row, further={**row.further, name: text}) for name, text in
+          (("known_reward", "true"), ("observation", "state"), ("algorithm", "Other"))),
+    ]  # fmt: skip
+    append_rows(tmp_path / "rows.csv", [*others, row])
+    assert annotate(tmp_path / "rows.csv", about(model, model.get_env(), tuned=False), "ldd", 0.5) == 1
+    assert [found["ldd"] for found in read_rows(tmp_path / "rows.csv").rows] == [*[""] * len(others), "0.5"]
+    before = DreamerV2.load(snapshots(), env=make_vec_env(ENV, 1), device="cpu")
+    matches = about(before, before.get_env(), tuned=True)
+    # Everything that came from one pre-training; other sizes and observations did not.
+    assert annotate(tmp_path / "rows.csv", matches, "intrinsic_reward", 1.0, FROM_ONE_PRETRAINING) == 5
+
+
+def test_rows_that_a_snapshot_cannot_tell_apart_are_not_written_to(tuned, tmp_path):
+    model = DreamerV2.load(tuned, env=make_vec_env(ENV, 1), device="cpu")
+    row = row_of(model, model.get_env(), run_evaluation(model, model.get_env(), 1))
+    path = tmp_path / "rows.csv"
+    append_rows(path, [row, replace(row, further={**row.further, "arm": "mine"})])
+    text = path.read_text()
+    with pytest.raises(ValueError, match="2 rows that may be about this agent, and they differ in arm"):
+        annotate(path, about(model, model.get_env(), tuned=False), "ldd", 0.5)
+    assert path.read_text() == text
 
 
 def test_a_file_without_the_agent_stays_as_it_is(tmp_path):

@@ -194,4 +194,139 @@ def test_bad_input_of_the_command(tmp_path: Path, capsys: Any) -> None:
     path.write_text(path.read_text() + "lbs,wal\n")
     assert main(["figures", str(path), *out, "--also-method", "mine", "--repetitions", "5"]) == 0
     said = capsys.readouterr()
-    assert "1 rows skipped:" in said.err and "mine + Dyna-MPC" in said.out
+    assert "1 row skipped:" in said.err and "mine + Dyna-MPC" in said.out
+
+
+# -- rows of other runs ----------------------------------------------------------------------------------------------------
+
+SHOT = replace(ROW, planner="mppi_zero_shot", keep_actor=False, further={"known_reward": "true"})
+
+
+def zero_shot_pair(shot: float, tuned: float, **changes: Any) -> list[Row]:
+    further = {**SHOT.further, **changes.pop("further", {})}
+    return [
+        replace(SHOT, finetune_frames=0, return_mean=shot, **changes, further={**further, "adaptation": "zero_shot"}),
+        replace(SHOT, return_mean=tuned, **changes, further={**further, "adaptation": "fine_tuned", "ldd": "0.2"}),
+    ]
+
+
+#: what makes other runs of a run, for each kind of column
+OTHERS: list[dict[str, Any]] = [
+    {"pretrain_frames": 100_000},
+    {"preset": "small"},
+    {"further": {"observation": "state"}},
+    {"further": {"perturbation": "easy"}},
+    {"further": {"variant": "sparse"}},
+    {"further": {"arm": "mine"}},
+    {"further": {"anything": "else"}},
+]
+
+
+@pytest.mark.parametrize("other", OTHERS, ids=str)
+def test_the_discrepancy_pairs_runs_with_themselves_only(other: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    points: list[Any] = []
+    monkeypatch.setattr(paper_figures, "scatter", lambda name, found, *rest: points.extend(found.get("walker", ())))
+    [mine, *_], alien = zero_shot_pair(400.0, 800.0), zero_shot_pair(100.0, 500.0, **other)
+    tuned = zero_shot_pair(400.0, 800.0)[1]
+    for rows in ([mine, tuned, alien[0]], [alien[0], tuned, mine]):
+        points.clear()
+        paper_figures.discrepancy(Study(rows))
+        assert points == [(0.2, 0.5)]
+    points.clear()
+    paper_figures.discrepancy(Study([tuned, alien[0]]))
+    assert points == []
+
+
+def test_only_what_planned_alone_is_a_point_of_the_discrepancy(monkeypatch: pytest.MonkeyPatch) -> None:
+    points: list[Any] = []
+    monkeypatch.setattr(paper_figures, "scatter", lambda name, found, *rest: points.extend(found["walker"]))
+    acted = [replace(ROW, planner=planner, further={"ldd": "0.9"}) for planner in ("none", "dyna_mpc")]
+    paper_figures.discrepancy(Study([*zero_shot_pair(400.0, 800.0), *acted]))
+    assert points == [(0.2, 0.5)]
+
+
+@pytest.mark.parametrize("other", [*OTHERS[:1], *OTHERS[3:5]], ids=str)
+def test_the_bars_of_zero_shot_are_of_one_length_and_the_task_itself(
+    other: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(paper_figures, "domain_bars", lambda study, name, arms, *rest: seen.extend(arms))
+    paper_figures.zero_shot(Study([*zero_shot_pair(400.0, 800.0), *zero_shot_pair(100.0, 500.0, **other)]))
+    assert [[row.return_mean for row in arm.rows] for arm in seen] == [[], [400.0], [800.0]]
+
+
+def test_jaco_is_compared_with_the_target_that_can_be_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(paper_figures, "domain_bars", lambda study, name, arms, *rest: seen.extend(arms))
+    jaco = {"domain": "jaco", "task": "reach_top_left", "further": {"variant": "fixed"}}
+    alone = replace(
+        ROW, method="dreamer", pretrain_frames=0, keep_actor=None, keep_critic=None, planner="none", return_mean=1.0
+    )
+    moving = replace(alone, domain="jaco", task="reach_top_left", return_mean=3.0)
+    rows = [*zero_shot_pair(1.0, 2.0, **jaco), alone, moving, replace(moving, return_mean=4.0, further={"variant": "fixed"})]
+    paper_figures.zero_shot(Study(rows))
+    assert [[row.return_mean for row in arm.rows] for arm in seen] == [[1.0, 4.0], [1.0], [2.0]]
+
+
+def test_a_known_reward_is_compared_with_the_same_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(paper_figures, "domain_bars", lambda study, name, arms, *rest: seen.extend(arms))
+    plain = replace(ROW, planner="none", return_mean=1.0)
+    known = replace(plain, return_mean=2.0, further={"known_reward": "True"})
+    rows = [known, plain, replace(plain, preset="small", return_mean=9.0), *zero_shot_pair(400.0, 800.0)]
+    paper_figures.known_reward(Study(rows))
+    assert [[row.return_mean for row in arm.rows] for arm in seen] == [[1.0], [2.0]]
+
+
+def test_captions_count_what_is_shown_and_name_the_rest() -> None:
+    others = [replace(ROW, domain="finger", task="spin", seed=seed) for seed in range(5)]
+    study = Study([*paper_s_rows(), *others])
+    for picture in (paper_figures.benchmark(study), paper_figures.profiles(study, 5)):
+        assert picture is not None
+        assert "1 seed a task" in picture.caption
+        assert "no reference score is known: finger-spin" in picture.caption
+    assert paper_figures.benchmark(Study(others)) is None
+
+
+def test_profiles_say_how_many_tasks_are_behind() -> None:
+    picture = paper_figures.profiles(Study([ROW, replace(ROW, seed=1)]), 5)
+    assert [line.get_label() for line in picture.figure.axes[0].lines] == ["LBS + Dyna-MPC (1 of 12 tasks)"]  # type: ignore[union-attr]
+
+
+def test_longer_pre_training_is_of_the_full_method(rows: list[Row]) -> None:
+    picture = paper_figures.longer_pretraining(Study(rows))
+    assert picture is not None and "with Dyna-MPC" in picture.caption
+    axes = picture.figure.axes[0]
+    # 4M was never run: a tick and a gap, as far apart as frames are.
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["1M", "2M", "3M", "4M", "5M"]
+    assert list(axes.get_xticks()) == [1, 2, 3, 4, 5] and "no runs" in words(picture)
+    line = next(line for line in axes.lines if line.get_label() == "LBS")
+    assert [math.isnan(y) for y in line.get_ydata()] == [False, False, False, True, False]
+    assert paper_figures.longer_pretraining(Study([row for row in rows if row.planner == "none"])) is None
+
+
+@pytest.mark.parametrize("name", ["finetune", "pretrain"])
+def test_a_budget_of_nothing_is_refused(name: str, tmp_path: Path, capsys: Any) -> None:
+    append_rows(tmp_path / "rows.csv", [ROW])
+    assert main(["figures", str(tmp_path / "rows.csv"), "--out", str(tmp_path / "out"), f"--{name}-frames", "0"]) == 2
+    assert f"--{name}-frames must be an integer of at least 1" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        Study([ROW], **{name: 0})
+
+
+def test_the_command_names_what_it_shows_nowhere_and_what_lay_there_before(tmp_path: Path, capsys: Any) -> None:
+    odd = replace(ROW, keep_critic=True)
+    append_rows(tmp_path / "rows.csv", [ROW, odd])
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("perturbed.png", "learning_curves_2.pdf", "mine.png"):
+        (out / name).write_bytes(b"")
+    assert main(["figures", str(tmp_path / "rows.csv"), "--out", str(out), "--repetitions", "5"]) == 0
+    said = capsys.readouterr().err
+    assert "1 row fits no table or figure" in said and "1 with domain=walker" in said and "keep_critic=true" in said
+    assert "that these rows did not make: learning_curves_2.pdf, perturbed.png." in said
+    append_rows(tmp_path / "others.csv", [replace(ROW, domain="finger", task="spin")])
+    assert main(["figures", str(tmp_path / "others.csv"), "--out", str(out)]) == 2
+    assert "--also-task NAME lets others in" in capsys.readouterr().err
+    assert main(["figures", str(tmp_path / "rows.csv"), "--out", str(tmp_path / "rows.csv")]) == 2
+    assert "is a file: give a folder" in capsys.readouterr().err

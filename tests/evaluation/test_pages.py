@@ -129,7 +129,7 @@ def test_warnings_stand_on_the_page(run: Path, tmp_path: Path) -> None:
     (copy / "rows.csv").write_text((copy / "rows.csv").read_text() + "lbs,wal\n")
     assert main(["report", str(copy)]) == 0
     text = Page((copy / "report.html").read_text()).text
-    assert "snapshot.zip" in text and "1 rows skipped" in text
+    assert "snapshot.zip" in text and "1 row skipped" in text
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="the same page is parsed above; this opens it, too")

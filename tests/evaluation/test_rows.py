@@ -140,7 +140,7 @@ def test_a_row_cut_anywhere_is_skipped_and_named(cut: int, tmp_path: Path) -> No
     path.write_bytes(path.read_bytes()[:-cut] if cut > 1 else path.read_bytes()[:-2])
     read = read_rows(path)
     assert [row.seed for row in read.rows] == [0] and len(read.skipped) == 1
-    assert read.report().startswith("1 rows skipped:") and "line 3" in read.report()
+    assert read.report().startswith("1 row skipped:") and "line 3" in read.report()
 
 
 @pytest.mark.parametrize(
@@ -157,6 +157,16 @@ def test_a_row_cut_anywhere_is_skipped_and_named(cut: int, tmp_path: Path) -> No
         (LINE.format(seed=0, value=1).replace("2000000", "lots"), "pretrain_frames='lots'"),
         (LINE.format(seed=0, value=1).replace("2000000", "-5"), "pretrain_frames='-5'"),
         (LINE.format(seed=0, value=1).replace(",10,", ",0,"), "episodes='0'"),
+        (LINE.format(seed="9" * 400, value=1), "seed='999"),
+        (LINE.format(seed="1_0", value=1), "seed='1_0'"),
+        (LINE.format(seed="\u0663", value=1), "seed="),
+        (LINE.format(seed=0, value="1_000"), "return_mean='1_000'"),
+        (LINE.format(seed=0, value="1e308"), "return_mean='1e308'"),
+        (LINE.format(seed=0, value=1).replace(",10,", "," + "9" * 400 + ","), "episodes='999"),
+        (LINE.format(seed=0, value=1).replace("2000000", "9" * 400), "pretrain_frames='999"),
+        (LINE.format(seed=0, value=1).replace("2000000", "1e300"), "pretrain_frames='1e300'"),
+        (LINE.format(seed=0, value=1).replace("17.5", "-3"), "return_std='-3'"),
+        (LINE.format(seed=0, value=1).replace(",81", ",-81"), "seconds='-81'"),
     ],
 )
 def test_an_unreadable_row_is_skipped_and_named(line: str, reason: str, tmp_path: Path) -> None:
@@ -224,6 +234,40 @@ def test_a_file_without_the_columns_is_refused(tmp_path: Path) -> None:
     path.write_text("")
     with pytest.raises(ValueError, match="lacks the columns"):
         read_rows(path)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_may_end_as_on_any_machine(end: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_bytes(end.join([HEADER, LINE.format(seed=0, value=1), LINE.format(seed=1, value=2), ""]).encode())
+    assert append_row(path, replace(ROW, seed=2))
+    read = read_rows(path)
+    assert [row.seed for row in read.rows] == [0, 1, 2] and read.report() == ""
+
+
+@pytest.mark.parametrize("seed", [2**53 + 1, 2**64 - 1])
+def test_large_seeds_are_told_apart(seed: int, tmp_path: Path) -> None:
+    assert append_rows(tmp_path / "rows.csv", [replace(ROW, seed=seed), replace(ROW, seed=seed - 1, return_mean=1.0)]) == 2
+    assert [row.seed for row in read_rows(tmp_path / "rows.csv").rows] == [seed, seed - 1]
+
+
+def test_the_same_run_in_another_spelling_is_the_same_run(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    line = LINE.format(seed=0, value=1)
+    odd = LINE.format(seed=0, value=2).replace("lbs", "LBS").replace("dyna_mpc", "Dyna_MPC").replace("true", "True")
+    path.write_text(f"{HEADER},observation,known_reward\n{line},state,\n{odd},State,False\n")
+    read = read_rows(path)
+    assert len(read.disagreements) == 1 and [row.return_mean for row in read.rows] == [2]
+    known = [replace(ROW, further={"known_reward": text}).key for text in ("true", "True", "1", " yes")]
+    assert len(set(known)) == 1 and known[0] != ROW.key == replace(ROW, further={"known_reward": "no"}).key
+
+
+@pytest.mark.parametrize(("column", "text"), [("known_reward", "perhaps"), ("ldd", "much"), ("intrinsic_reward", "inf")])
+def test_further_columns_that_mean_something_are_checked(column: str, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text(f"{HEADER},{column}\n{LINE.format(seed=0, value=1)},{text}\n")
+    read = read_rows(path)
+    assert read.rows == [] and f"{column}='{text}'" in read.report()
 
 
 @pytest.mark.parametrize(

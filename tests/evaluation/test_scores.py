@@ -97,6 +97,24 @@ def test_the_last_evaluation_within_the_budget_counts() -> None:
     assert [row.finetune_frames for row in final_rows(rows, 2_000_000)[0]] == [2_000_000]
 
 
+@pytest.mark.parametrize(
+    ("evaluated", "counts"),
+    [
+        ([90_000, 110_000], 110_000),
+        ([90_000, 100_000, 104_000], 100_000),
+        ([96_000, 110_000], 96_000),
+        ([99_000, 101_000], 101_000),
+        ([90_000, 125_000], 125_000),
+        ([0, 90_000], None),
+        ([90_000, 2_000_000], None),
+    ],
+)
+def test_which_evaluation_is_the_one_at_the_budget(evaluated: list[int], counts: int | None) -> None:
+    done, other = final_rows([replace(ROW, finetune_frames=frames) for frames in evaluated], 100_000)
+    assert [row.finetune_frames for row in done] == ([] if counts is None else [counts])
+    assert [row.finetune_frames for row in other] == ([90_000] if counts is None else [])
+
+
 RAGGED = st.lists(st.lists(st.floats(-2, 2), min_size=1, max_size=6), min_size=1, max_size=5)
 
 

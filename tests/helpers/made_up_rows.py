@@ -67,7 +67,10 @@ def _benchmark(row: Any, methods: tuple[str, ...], task: str, seed: int) -> Iter
         for pretrain in (100_000, 500_000, 1_000_000, 2_000_000, 3_000_000, 5_000_000):
             grown = share * (0.6 + 0.4 * min(1.0, pretrain / PRETRAIN))
             seen = {"intrinsic_reward": round(1.5 - grown + 0.02 * len(task), 3)} if pretrain == PRETRAIN else {}
-            yield row(method, task, seed, grown - 0.06, pretrain_frames=pretrain, **seen)
+            if pretrain <= PRETRAIN:
+                yield row(method, task, seed, grown - 0.06, pretrain_frames=pretrain, **seen)
+            if pretrain >= 1_000_000 and pretrain != PRETRAIN:
+                yield row(method, task, seed, grown, planner="dyna_mpc", pretrain_frames=pretrain)
         yield row(method, task, seed, share, planner="dyna_mpc")
         for frames in range(10_000, FINETUNE, 10_000):
             yield row(method, task, seed, (share - 0.06) * (0.4 + 0.6 * frames / FINETUNE), finetune_frames=frames)
