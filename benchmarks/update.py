@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from itertools import product
+from typing import Any
 
 import torch as th
 from common import Floor, Product, interleaved, make_model, parser, report
@@ -48,7 +49,7 @@ def main() -> None:
     floors = {}
     for precision, compile in product(options.precision, options.compile):
         for phase in options.phases:
-            model = make_model(options, precision=precision, intrinsic_reward=PHASES[phase], compile=compile)
+            model = make_model(options, precision=precision, compile=compile, **PHASES[phase])
             model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
             learner, batch = model.learner, model.replay_buffer.sample(model.batch_size)
             row = ", ".join([phase, precision, *([compile] if len(options.compile) > 1 else [])])
@@ -62,7 +63,12 @@ def main() -> None:
     report("update", interleaved(work, options, model.device), floors, options, model.device)
 
 
-PHASES = {"pre-training (LBS)": "lbs", "fine-tuning": None}
+PHASES: dict[str, dict[str, Any]] = {
+    "pre-training (LBS)": {"intrinsic_reward": "lbs"},
+    "fine-tuning": {},
+    # Its planner asks no critic, so neither actor nor critic learns.
+    "fine-tuning for MPPI": {"planner": "mppi"},
+}
 
 if __name__ == "__main__":
     main()
