@@ -23,7 +23,8 @@ class DrQAgent(nn.Module):
     :param frame_stack: frames an observation has
     :param cnn_depth: channels of the encoder's convolutions
     :param feature_size: of the trunks of actor and critic
-    :param net_arch: hidden layers of actor and critic; the last one's width is that of the intrinsic reward's networks, too
+    :param net_arch: hidden layers of actor and critic; the last one's width (without any, ``feature_size``) is that of the
+        intrinsic reward's networks, too
     :param intrinsic: what it explores with, not yet built; None for an agent that learns a task
     """
 
@@ -52,7 +53,7 @@ class DrQAgent(nn.Module):
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.intrinsic = copy.deepcopy(intrinsic)
         if self.intrinsic is not None:
-            self.intrinsic.build(EncoderSizes(size, action_size, net_arch[-1]))
+            self.intrinsic.build(EncoderSizes(size, action_size, [feature_size, *net_arch][-1]))
 
     @property
     def explores(self) -> bool:

@@ -45,7 +45,7 @@ class DrQPolicy(AgentPolicy[FrameMemory]):
     :param lr_schedule: unused here (the learner owns the optimisers), part of SB3's interface
     :param cnn_depth: channels of the encoder's convolutions
     :param feature_size: of the trunks of actor and critic
-    :param net_arch: hidden layers of actor and critic, [1024, 1024] if None
+    :param net_arch: hidden layers of actor and critic, [1024, 1024] if None; [] is a linear layer after the trunk
     :param frame_stack: frames that the agent sees at once
     :param noise_std: standard deviation of the noise that it explores with
     :param intrinsic: what the agent explores with, not yet built; None for an agent that learns a task
@@ -80,8 +80,6 @@ class DrQPolicy(AgentPolicy[FrameMemory]):
         for name, size in [*sizes.items(), *((f"net_arch[{i}]", width) for i, width in enumerate(net_arch))]:
             if not is_integer(size) or size < 1:
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
-        if len(net_arch) == 0:
-            raise ValueError("policy_kwargs: net_arch must name at least one hidden layer, got [].")
         self.agent = DrQAgent(
             self.observations, self.actions.size, frame_stack, net_arch=net_arch, intrinsic=intrinsic, **sizes
         )

@@ -94,7 +94,6 @@ def test_the_benchmarks_defaults():
         ),
         ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"ensemble_size": 1}}, "ensemble_size .*got 1"),
         ({"intrinsic_reward": "disagreement", "intrinsic_kwargs": {"trains_encoder": 1}}, "trains_encoder .*got 1"),
-        ({"policy_kwargs": {"net_arch": []}}, "net_arch must name at least one hidden layer"),
         ({"policy_kwargs": {"feature_size": 0}}, "feature_size must be a positive integer, got 0"),
         ({"policy_kwargs": {"frame_stack": 2}}, r"Unknown policy_kwargs \['frame_stack'\]"),
         ({"preset": "large"}, "Unknown preset 'large'; known are .*'small'"),

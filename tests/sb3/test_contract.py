@@ -20,7 +20,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
-from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, register_intrinsic_reward
+from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, DrQv2, register_intrinsic_reward
 from sb3_dreamer_urlb.dreamer_v2.policies import MlpPolicy
 from sb3_dreamer_urlb.envs import SupervisedVecEnv
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
@@ -204,6 +204,17 @@ def test_hidden_layers_are_those_of_net_arch(net_arch, action_space, seen, tmp_p
     loaded = DreamerV2.load(tmp_path / "model")
     observation = space.sample()
     assert np.array_equal(*(one.predict(observation, deterministic=True)[0] for one in (model, loaded)))
+
+
+@pytest.mark.parametrize("method", [None, "disagreement"])
+def test_drq_v2_may_have_no_hidden_layer(method, tmp_path):
+    env = CounterEnv(8, observation_space=VECTOR, terminates=True)
+    kwargs = {"preset": "tiny", "seed": 0, "intrinsic_reward": method, "policy_kwargs": {"net_arch": []}}
+    model = DrQv2("MlpPolicy", env, **kwargs).learn(40)
+    assert model._n_updates > 0
+    model.save(tmp_path / "model")
+    seen = VECTOR.sample()
+    assert np.array_equal(*(one.predict(seen, deterministic=True)[0] for one in (model, DrQv2.load(tmp_path / "model"))))
 
 
 def test_a_linear_actor_is_linear():
