@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 
+from sb3_dreamer_urlb.algorithm.checks import check_scheduled_rate
 from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
 from sb3_dreamer_urlb.learning import graphs
@@ -177,6 +178,7 @@ class AgentAlgorithm(PhasedAlgorithm):
         remaining = max(self._current_progress_remaining, 0.0)
         rates = self._learning_rates(remaining)
         for name, optimizer in self.learner.optimizers().items():
+            check_scheduled_rate(f"The schedule of {name}", rates[name], remaining)
             optimizer.set_learning_rate(rates[name])
         self.logger.record("train/learning_rate", self.lr_schedule(remaining))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

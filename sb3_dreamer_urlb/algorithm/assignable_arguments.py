@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 from typing import Any, ClassVar
 
+import numpy as np
+
 from sb3_dreamer_urlb.number_checks import plain
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
@@ -19,12 +21,36 @@ class AssignableArguments(SavedAlgorithm):
     #: arguments that decide what fine-tuning trains
     before_fine_tuning: ClassVar[frozenset[str]] = frozenset()
 
+    #: dictionaries among the arguments, as they are in force
+    _dictionaries: dict[str, dict[str, Any]]
+
     def __setattr__(self, name: str, value: Any) -> None:
         """As ever, but for arguments of a model that is built.
 
         :raises AttributeError: for an argument that networks or replay were built with
         :raises ValueError: for a value that does not fit; the old one stays
         """
+        self._assign(name, value)
+        if name == "policy" or (self.assignable is not None and name in self.assignable):
+            watched = () if self.assignable is None else _watched_arguments(type(self))
+            super().__setattr__(
+                "_dictionaries",
+                {one: plain(value) for one in watched if isinstance(value := vars(self).get(one), dict)},
+            )
+
+    def take_over_changes(self) -> None:
+        """What was changed within a dictionary was assigned: nobody heard of it.
+
+        :raises AttributeError: as for assigning; the old values are back then
+        :raises ValueError: likewise
+        """
+        for name, before in vars(self).get("_dictionaries", {}).items():
+            now = vars(self)[name]
+            if not same(before, now):
+                super().__setattr__(name, plain(before))
+                self.__setattr__(name, now)
+
+    def _assign(self, name: str, value: Any) -> None:
         if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
             super().__setattr__(name, value)
             return
@@ -57,6 +83,15 @@ class AssignableArguments(SavedAlgorithm):
 
         :raises ValueError: for a value that does not fit; nothing is told yet
         """
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two values of an argument are equal, arrays in them included."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(same(value, b[key]) for key, value in a.items())
+    if type(a) is type(b) and isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a is b or np.array_equal(a, b)
 
 
 @functools.cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
@@ -24,6 +25,7 @@ from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
+from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 
 #: arguments of every replay that the algorithm fills in itself
 REPLAY_ARGUMENTS_OF_THE_MODEL = {
@@ -55,6 +57,17 @@ def check_learn(total_timesteps: Any, log_interval: Any) -> None:
         check_integer("log_interval", log_interval, 1)
 
 
+def check_has_numbers(env: Any) -> None:
+    """Before Stable-Baselines3 makes an array for observations.
+
+    :param env: what was given as environment
+    :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
+    """
+    space = getattr(env, "observation_space", None)
+    if isinstance(space, spaces.Space) and not isinstance(space, spaces.Dict | spaces.Tuple) and space.shape is None:
+        raise UnsupportedSpaceError(f"Observations must be arrays of numbers, or several by name in a Dict, got {space}.")
+
+
 def check_settings(model: SavedAlgorithm) -> None:
     """What is not an algorithm's own, but Stable-Baselines3's: it takes anything, and fails later.
 
@@ -68,6 +81,19 @@ def check_settings(model: SavedAlgorithm) -> None:
         raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         check_dict(name, getattr(model, name))
+
+
+def check_length(total_timesteps: Any, log_interval: Any) -> None:
+    """What ``learn`` is told.
+
+    :param total_timesteps: a number
+    :param log_interval: a positive integer, or None for no log
+    :raises ValueError: naming the argument, its value and what was expected
+    """
+    if not is_number(total_timesteps):
+        raise ValueError(f"total_timesteps must be a number of agent steps, got {total_timesteps!r}.")
+    if log_interval is not None:
+        check_integer("log_interval", log_interval, 1)
 
 
 def check_schedule_of_updates(model: SavedAlgorithm) -> None:
@@ -109,10 +135,39 @@ def check_rate(name: str, value: Any) -> None:
     """
     :param name: of the argument, for the message
     :param value: what was given
-    :raises ValueError: for what is no learning rate
+    :raises ValueError: for what is no learning rate, and for a schedule that does not begin with one
     """
-    if not callable(value) and not (is_finite_number(value) and value >= 0):
-        raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+    if not callable(value):
+        if not _is_rate(value):
+            raise ValueError(f"{name} must be a non-negative number or a schedule, got {value!r}.")
+        return
+    try:
+        first = value(1.0)
+    except Exception as error:
+        raise ValueError(
+            f"{name} must be a function of the share of the run that is left, 1 to 0: called with 1.0, it raises "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    check_scheduled_rate(name, first, 1.0)
+
+
+def check_scheduled_rate(name: str, rate: Any, remaining: float) -> None:
+    """
+    :param name: of the argument, or of what learns by it, for the message
+    :param rate: what the schedule gave
+    :param remaining: for this share of the run
+    :raises ValueError: if it is no learning rate
+    """
+    try:
+        fits = _is_rate(float(rate))
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise ValueError(f"{name} must give non-negative numbers: with {remaining:.4g} of the run left it gives {rate!r}.")
+
+
+def _is_rate(value: Any) -> bool:
+    return is_finite_number(value) and value >= 0
 
 
 def check_forms(precision: Any, compile: Any) -> None:

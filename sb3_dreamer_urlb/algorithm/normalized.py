@@ -1,10 +1,15 @@
-"""What a pre-trained agent is shown of the same state must stay the same in fine-tuning: VecNormalize's statistics."""
+"""What a trained agent is shown of the same state must stay the same when it goes on: VecNormalize's statistics."""
 
 from __future__ import annotations
 
 import copy
+import warnings
+from collections.abc import Mapping
 
+import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_dreamer_urlb.snapshots import normalization
 
 
 def _how(normalizer: VecNormalize | None) -> dict[str, object] | None:
@@ -40,3 +45,39 @@ def carry_over(before: VecNormalize | None, after: VecNormalize | None) -> None:
     """
     if before is not None and after is not None and before is not after and after.norm_obs:
         after.obs_rms = copy.deepcopy(before.obs_rms)
+
+
+def go_on(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
+    """Let an agent that has learnt go on in another environment.
+
+    A VecNormalize that has seen nothing takes the statistics over. Warns where the agent would see other numbers for the same
+    state.
+
+    :param known: all statistics of the VecNormalize that it learnt behind, empty without
+    :param after: of the environment, None without; changed in place
+    """
+    known = normalization.of_observations(known)
+    its = normalization.of_observations(normalization.pack(after))
+    if after is None or not its:
+        if known:
+            warnings.warn(
+                "The model has learnt from observations behind VecNormalize, this environment shows them as they are: it "
+                "would see other numbers for the same state. Wrap it in VecNormalize, which takes the statistics over."
+            )
+        return
+    if not _has_seen_nothing(after):
+        return
+    if {name: value.shape for name, value in known.items()} == {name: value.shape for name, value in its.items()}:
+        normalization.put(after, known)
+    else:
+        what = "of other observations" if known else "that its file knows nothing of"
+        warnings.warn(
+            f"The model goes on behind a VecNormalize {what}, which has seen nothing yet: it would see other numbers for the "
+            "same state. Load the statistics that it learnt with: VecNormalize.load."
+        )
+
+
+def _has_seen_nothing(normalizer: VecNormalize) -> bool:
+    """Or a reset at most."""
+    seen = [part.count for name, part in normalization.statistics(normalizer).items() if name != normalization.RETURN]
+    return max(seen) < normalizer.num_envs + 1

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
+from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Any, TypeVar
 
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -24,6 +26,7 @@ from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, Upda
 from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
+from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
@@ -68,6 +71,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         for name in ("policy_kwargs", "replay_buffer_kwargs"):
             # Stable-Baselines3 takes whatever is false for an empty one.
             check_dict(name, kwargs.get(name))
+        checks.check_has_numbers(env)
         super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
         self.intrinsic_reward = intrinsic_reward
         self.overlap = overlap
@@ -121,6 +125,10 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
             raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}{dicts}.")
         return self.policy_aliases[policy_name]
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """As SB3's, which takes no numpy number."""
+        super().set_random_seed(plain(seed))
+
     @property
     def skipped_updates(self) -> int:
         """Updates so far, in both phases, that were skipped because a loss or gradient was not finite."""
@@ -158,8 +166,18 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         :param force_reset: reset it before going on
         :raises ValueError: if it does not fit; the model stays as it is
         """
-        super().set_env(self.prepare_env(env), force_reset)
+        wrapped, known = self.prepare_env(env), self._known_statistics()
+        super().set_env(wrapped, force_reset)
         self._read_env()
+        self._go_on_normalized(known)
+
+    def _known_statistics(self) -> Mapping[str, th.Tensor]:
+        """Of the VecNormalize that the model has learnt behind."""
+        return self.loaded_statistics if self.env is None else normalization.pack(self._vec_normalize_env)
+
+    def _go_on_normalized(self, known: Mapping[str, th.Tensor]) -> None:
+        if max(self.phase_timesteps, self.num_timesteps) > 0:
+            normalized.go_on(known, self._vec_normalize_env)
 
     def _read_env(self) -> None:
         """What the environment tells about itself beyond its spaces."""
@@ -276,6 +294,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         """
         total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
         checks.check_learn(total_timesteps, log_interval)
+        self.take_over_changes()
         with self.during_learn:
             if resume_if_asked(self, callback):
                 total_timesteps, reset_num_timesteps = max(total_timesteps - self.num_timesteps, 0), False

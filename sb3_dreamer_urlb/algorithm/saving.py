@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import torch as th
@@ -27,6 +27,10 @@ class SavingAlgorithm(RunningAlgorithm):
     @abstractmethod
     def go_on_where_left(self) -> None:
         """Begin without a reset, if a model left the environments where they stand now."""
+
+    @abstractmethod
+    def _go_on_normalized(self, known: Mapping[str, th.Tensor]) -> None:
+        """Let the environment's VecNormalize take statistics over, or warn, see ``normalized.go_on``."""
 
     @abstractmethod
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
@@ -74,6 +78,8 @@ class SavingAlgorithm(RunningAlgorithm):
         """
         check_load_keywords(cls, kwargs)
         model = model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
+        if model.env is not None:
+            model._go_on_normalized(model.loaded_statistics)
         if not force_reset:
             model.go_on_where_left()
         return model

@@ -41,8 +41,8 @@ def save(model: SavedAlgorithm, target: Target, run: dict[str, Any] | None = Non
     :raises ValueError: if a weight is not finite, or the file could not be read again; the old file stays
     :raises OSError: naming the path; the old file stays
     """
-    # Who saves a model alone saves its VecNormalize apart, as with every algorithm of SB3.
-    statistics = {} if run is None else normalization.pack(model.get_vec_normalize_env())
+    model.take_over_changes()
+    statistics = normalization.pack(model.get_vec_normalize_env()) if model.env is not None else model.loaded_statistics
     mine, data = _all_tensors(model), describe(model, run)
     content = tensors.pack({**mine, **statistics})
     _check_readable(model, data, tensors.table_of(mine))
@@ -150,6 +150,7 @@ def load(
         loaded = tensors.unpack(archive, TENSORS)
         statistics = {name: loaded.pop(name) for name in list(loaded) if name.startswith(normalization.PREFIX)}
         _put(model, loaded)
+        model.loaded_statistics = statistics
         # Runs that start from one unseeded model are meant to differ.
         if states is not None and (resume or model.seed is not None) and "seed" not in kwargs:
             states.apply(model)

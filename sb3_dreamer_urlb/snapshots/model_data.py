@@ -107,7 +107,7 @@ def blank(
     arguments = dict(data["arguments"])
     unknown = sorted(set(arguments) - set(known))
     if unknown:
-        raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not")
+        raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not: is it another algorithm's?")
     given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
     _check_method(arguments, given)
     if isinstance(given.get("planner"), Planner):
@@ -129,6 +129,8 @@ def blank(
     if isinstance(decoded.get("train_freq"), list):
         decoded["train_freq"] = tuple(decoded["train_freq"])
     policy = custom.get("policy", custom.get("policy_class", data["policy"]))
+    if not isinstance(policy, str | type) and policy is not data["policy"]:
+        raise ValueError(f"policy must be one of {sorted(algorithm.policy_aliases)} or a class, got {policy!r}.")
     if not isinstance(policy, str | type):
         raise ValueError(
             f"its policy was {values.decode(policy)}, which no file can hold; give it again: "

@@ -1,9 +1,11 @@
-"""VecNormalize's running statistics ↔ tensors of a run folder's checkpoint; SB3's own file of them is a pickle.
+"""VecNormalize's running statistics ↔ tensors of a model's file; SB3's own file of them is a pickle.
 
-The statistics are the run's, everything else of a VecNormalize (what it normalises, its bounds) is the script's.
+The statistics are the file's, everything else of a VecNormalize (what it normalises, its bounds) is the script's.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import torch as th
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -44,6 +46,14 @@ def pack(normalizer: VecNormalize | None) -> dict[str, th.Tensor]:
     }
 
 
+def of_observations(stored: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
+    """Those of what an agent sees.
+
+    :param stored: what :func:`pack` gave
+    """
+    return {name: value for name, value in stored.items() if name.startswith(f"{PREFIX}{OBSERVATION}")}
+
+
 def split(table: Table) -> tuple[Table, Table]:
     """A file's table without the statistics, and theirs."""
     theirs = {name: entry for name, entry in table.items() if name.startswith(PREFIX)}
@@ -67,7 +77,18 @@ def restore(normalizer: VecNormalize, stored: dict[str, th.Tensor]) -> None:
             raise ValueError(f"{name} has the shape {list(value.shape)}, the environment's {list(expected[name].shape)}")
         if not name.endswith(".mean") and bool((value < 0).any()):
             raise ValueError(f"{name} holds negative values")
+    put(normalizer, stored)
+
+
+def put(normalizer: VecNormalize, stored: Mapping[str, th.Tensor]) -> None:
+    """Put statistics into an environment whose own are of just these shapes; those that are not given stay.
+
+    :param normalizer: changed in place
+    :param stored: what :func:`pack` gave, or some of it
+    """
     for name, target in statistics(normalizer).items():
+        if f"{PREFIX}{name}.mean" not in stored:
+            continue
         target.mean = stored[f"{PREFIX}{name}.mean"].numpy().copy()
         target.var = stored[f"{PREFIX}{name}.var"].numpy().copy()
         target.count = float(stored[f"{PREFIX}{name}.count"])

@@ -31,7 +31,8 @@ def capture(model: SavedAlgorithm) -> dict[str, Any]:
         "cuda": th.cuda.get_rng_state(model.device).numpy().tobytes().hex() if model.device.type == "cuda" else None,
         "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002  (SB3 draws from the global one)
         "python": [version, list(internal), gauss],
-        "sampler": generator_state(model.replay_buffer.rng),
+        # Who only wants to save may have dropped the replay.
+        "sampler": None if (buffer := getattr(model, "replay_buffer", None)) is None else generator_state(buffer.rng),
         "action_space": generator_state(model.action_space.np_random),
     }
 
@@ -63,8 +64,9 @@ class RandomStates:
         if type(state["pos"]) is not int or not 0 <= state["pos"] <= 624 or len(state["key"]) != 624:
             raise ValueError("its random states are damaged")
         np.random.RandomState().set_state(self.numpy)
-        for generator_state in (self.sampler, self.action_space):
-            set_generator(np.random.default_rng(), generator_state)
+        set_generator(np.random.default_rng(), self.action_space)
+        if self.sampler is not None:
+            set_generator(np.random.default_rng(), self.sampler)
 
     def apply(self, model: SavedAlgorithm) -> None:
         """Set the global generators, and the model's."""
@@ -73,7 +75,8 @@ class RandomStates:
             th.cuda.set_rng_state(self.cuda, model.device)
         np.random.set_state(self.numpy)  # noqa: NPY002
         random.setstate(self.python)
-        set_generator(model.replay_buffer.rng, self.sampler)
+        if self.sampler is not None:
+            set_generator(model.replay_buffer.rng, self.sampler)
         set_generator(model.action_space.np_random, self.action_space)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import torch as th
@@ -35,6 +37,8 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     preset: str
     #: of ``KEPT``: whether the fine-tuning began with the pre-trained one; None where nobody knows
     kept: dict[str, bool] | None
+    #: of the VecNormalize that it learnt behind, as a file had them; empty without
+    loaded_statistics: Mapping[str, th.Tensor] = MappingProxyType({})
 
     @abstractmethod
     def _prepare(self) -> None:
@@ -54,6 +58,9 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     @abstractmethod
     def adams(self) -> dict[str, th.optim.Adam]:
         """What holds the moments of each trained part; the names are those in files."""
+
+    def take_over_changes(self) -> None:
+        """Arguments that were changed in a way that the model did not hear of are in force from now on, or refused."""
 
     @classmethod
     def argument_names(cls) -> list[str]:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.algorithm.assignable_arguments import same
 from sb3_dreamer_urlb.dreamer_v2.arguments import ASSIGNABLE
 
 #: another value for each, and where it is in force
@@ -79,6 +85,32 @@ def test_what_was_built_is_not_assigned(tiny_model, name):
     with pytest.raises(AttributeError, match=rf"{name} cannot be assigned.*{way}{name}=\.\.\.\)"):
         setattr(model, name, before)
     assert getattr(model, name) is before
+
+
+@pytest.mark.parametrize("then", ["learn", "save"])
+def test_what_is_changed_within_a_dictionary_is_assigned(tiny_model, tmp_path, then):
+    model = tiny_model(planner="dyna_mpc", replay_buffer_kwargs={"sampling": "rows"})
+    act = {"learn": lambda: model.learn(4), "save": lambda: model.save(tmp_path / "m")}[then]
+    model.planner_kwargs["iterations"] = 7
+    act()
+    assert model.policy.planner.config.iterations == model.planner_kwargs["iterations"] == 7
+    model.planner_kwargs["iterations"] = 0
+    with pytest.raises(ValueError, match="iterations"):
+        act()
+    assert model.policy.planner.config.iterations == model.planner_kwargs["iterations"] == 7
+    for name, key, value in (("policy_kwargs", "net_arch", [9]), ("replay_buffer_kwargs", "sampling", "episodes")):
+        before = getattr(model, name)[key]
+        getattr(model, name)[key] = value
+        with pytest.raises(AttributeError, match=f"{name} cannot be assigned"):
+            act()
+        assert getattr(model, name)[key] == before
+    act()
+
+
+@given(st.recursive(st.one_of(st.integers(0, 3), st.text(max_size=1)), lambda x: st.lists(x) | st.dictionaries(st.text(), x)))
+def test_equal_values_are_the_same(value):
+    assert same(value, copy.deepcopy(value)) and not same(value, [value, value]) and not same({"a": value}, {"b": value})
+    assert same({"a": np.arange(3)}, {"a": np.arange(3)}) and not same({"a": np.arange(3)}, {"a": np.arange(4)})
 
 
 @pytest.mark.parametrize(("name", "value"), [("ent_coef", -1), ("gamma", "x"), ("batch_size", 0), ("learning_rate", None)])

@@ -55,6 +55,16 @@ def test_saving_draws_nothing(tiny_model, tmp_path):
     assert th.equal(before[0], th.get_rng_state()) and before[1] == model.replay_buffer.rng.bit_generator.state
 
 
+def test_a_model_without_its_replay_is_saved(tiny_model, tmp_path):
+    """To be small in memory, say."""
+    model = tiny_model().learn(12)
+    model.replay_buffer = None
+    model.save(tmp_path / "m")
+    del model.replay_buffer
+    model.save(tmp_path / "m")
+    assert DreamerV2.load(tmp_path / "m", CounterEnv(), device="cpu").learn(12).num_timesteps == 12
+
+
 def test_what_no_file_can_hold_is_said_when_saving(tiny_model, tmp_path):
     model = tiny_model(learning_rate=lambda _: 1e-3)
     with pytest.warns(UserWarning, match=r"No file can hold this model's learning_rate: .*custom_objects"):
@@ -93,7 +103,9 @@ def test_observations_for_predict(tiny_model):
 
 def test_spaces_without_numbers_or_without_bounds(tiny_model):
     most = float(th.finfo(th.float32).max)
-    with pytest.raises(ValueError, match="holds no number"):
+    with pytest.raises(ValueError, match="The observation space holds no number"):
         tiny_model(CounterEnv(observation_space=spaces.Box(0, 1, (0,))), "MlpPolicy")
+    with pytest.raises(ValueError, match="The action space holds no number"):
+        tiny_model(CounterEnv(action_space=spaces.Box(0, 1, (0,))))
     with pytest.raises(ValueError, match="finite bounds"):
         tiny_model(CounterEnv(action_space=spaces.Box(-most, most, (2,))))
