@@ -13,9 +13,11 @@ import numpy as np
 def plain(value: Any) -> Any:
     """numpy's scalars as Python's numbers and booleans, in dictionaries, lists and tuples, too; all else as it is.
 
+    So are arrays without axes, which some of numpy's functions give where others give scalars.
+
     Everything that takes arguments takes them through this: torch, Stable-Baselines3 and JSON each refuse some of numpy's.
     """
-    if isinstance(value, np.generic):
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
         return value.item()
     if type(value) is dict:
         return {key: plain(item) for key, item in value.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -108,6 +109,7 @@ class CollectingAlgorithm(SavingAlgorithm):
             with self._whole_step():
                 actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
                 new_obs, rewards, dones, infos = env.step(actions)
+                rewards, dones = np.asarray(rewards), np.asarray(dones, bool)
                 self._touches = last_touches(env)
                 self.num_timesteps += env.num_envs
                 self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]
@@ -182,8 +184,7 @@ class CollectingAlgorithm(SavingAlgorithm):
         # The VecEnv has already begun the next episode: put the true last observation back.
         next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
-            if (last := infos[i].get("terminal_observation")) is not None:
-                _put(next_obs, int(i), normalizer.unnormalize_obs(last) if normalizer is not None and undoes else last)
+            _put(next_obs, int(i), self._last_of_episode(int(i), infos[i], normalizer if undoes else None))
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
@@ -192,6 +193,24 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._last_original_obs = self._last_obs if original_obs is new_obs else copy.deepcopy(original_obs)
         self._last_episode_starts = dones.astype(bool)
         self._leave_standing()
+
+    def _last_of_episode(self, i: int, info: dict[str, Any], normalizer: VecNormalize | None) -> Any:
+        """The observation with which environment ``i`` ended its episode.
+
+        :param i: number of the environment
+        :param info: of the last step
+        :param normalizer: to undo, None if there is nothing to undo
+        """
+        last = info.get("terminal_observation")
+        if last is not None:
+            return last if normalizer is None else normalizer.unnormalize_obs(last)
+        if not env_steps.is_fault(info):
+            warnings.warn(
+                "The vectorised environment ends an episode without info['terminal_observation']: nobody knows its last "
+                "observation, the one before is taken for it."
+            )
+        before: Any = self._last_original_obs
+        return {name: part[i] for name, part in before.items()} if isinstance(before, dict) else before[i]
 
     # -- episodes ------------------------------------------------------------------------------------------------------
 

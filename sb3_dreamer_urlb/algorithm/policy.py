@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -68,10 +69,12 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     def check_spaces(
         cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool = True
     ) -> None:
-        """
+        """Warns of a space that may be meant otherwise.
+
         :raises UnsupportedSpaceError: for a space that this policy does not take
         """
-        cls._observations(observation_space, normalize_images)
+        for doubt in cls._observations(observation_space, normalize_images).doubts:
+            warnings.warn(doubt)
         cls._actions(action_space)
 
     @classmethod

@@ -40,6 +40,7 @@ class PhaseSwitchCallback(BaseCallback):
         keep_reward: bool = False,
     ):
         super().__init__(verbose)
+        pretrain_frames = plain(pretrain_frames)
         if not is_integer(pretrain_frames) or pretrain_frames < 1:
             raise ValueError(f"pretrain_frames must be a positive integer, got {pretrain_frames!r}.")
         self.pretrain_frames = pretrain_frames

@@ -125,5 +125,8 @@ def as_received(value: Any) -> Any:
 
 def shown(value: Any) -> str:
     """A value in a message."""
-    text = value.text if isinstance(value, Foreign) else repr(value)
+    try:
+        text = value.text if isinstance(value, Foreign) else repr(value)
+    except Exception:
+        text = f"an object of the class {type(value).__name__}"
     return text if len(text) <= 80 else f"{text[:77]}..."

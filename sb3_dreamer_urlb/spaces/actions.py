@@ -42,10 +42,12 @@ class BoxActions(Actions):
     """Numbers, scaled from the space's bounds to [-1, 1].
 
     :param space: with finite bounds
-    :raises UnsupportedSpaceError: if a dimension has no range, or an infinite one
+    :raises UnsupportedSpaceError: if there is no dimension, or one has no range, or an infinite one
     """
 
     def __init__(self, space: spaces.Box):
+        if 0 in space.shape:
+            raise UnsupportedSpaceError(f"The action space holds no number: {space}.")
         if not (space.low < space.high).all():
             raise UnsupportedSpaceError(
                 f"Every action dimension needs low < high, got {space} with low={space.low}, high={space.high}."

@@ -7,6 +7,7 @@ at the space itself. Which networks read and predict a kind, ``world_model/encod
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,9 @@ IMAGE_SIZES = (16, 512)
 
 class Observations(ABC):
     """One kind of observation. Raw ones are what the replay holds, any leading shape (…)."""
+
+    #: of spaces that may be meant otherwise, sentences for a warning
+    doubts: Sequence[str] = ()
 
     @abstractmethod
     def preprocess(self, raw: Observation) -> Observation:
@@ -188,6 +192,16 @@ def vectors(space: spaces.Space[Any], normalize_images: bool = True) -> Vectors:
     raise UnsupportedSpaceError(f"MlpPolicy needs one of the observation spaces {names}, got {space}.")
 
 
+def _may_be_meant_as_image(space: spaces.Space[Any]) -> bool:
+    """Pixels in a shape that Stable-Baselines3 takes for no image, or numbers in an image's shape."""
+    if not isinstance(space, spaces.Box):
+        return False
+    if space.dtype == np.uint8:
+        return len(space.shape) > 1 and bool((space.low == 0).all() and (space.high == 255).all())
+    sides = sorted(space.shape)
+    return len(sides) == 3 and min(space.shape[0], space.shape[2]) in (1, 3, 4) and sides[1] >= IMAGE_SIZES[0]
+
+
 class DictObservations(Observations):
     """Several observations by name. Embeddings are concatenated, losses of one kind are summed.
 
@@ -200,8 +214,15 @@ class DictObservations(Observations):
         if not isinstance(space, spaces.Dict) or len(space.spaces) == 0:
             raise UnsupportedSpaceError(f"MultiInputPolicy needs a Dict of observations, got {space}.")
         self.parts: dict[str, Observations] = {}
+        self.doubts = doubts = []
         for key, part in space.spaces.items():
             image = is_image_space(part, normalized_image=not normalize_images)
+            if not image and _may_be_meant_as_image(part):
+                doubts.append(
+                    f"Observation {key!r} is seen as a vector of {int(np.prod(part.shape or ()))} numbers, not as an image: "
+                    f"{part}. Images are Box(0, 255, (height, width, channels), uint8), or floats, channels first, with "
+                    'policy_kwargs={"normalize_images": False}.'
+                )
             try:
                 self.parts[key] = Images(part, normalize_images) if image else vectors(part, normalize_images)
             except UnsupportedSpaceError as error:

@@ -288,3 +288,24 @@ def test_a_method_that_does_not_say_what_a_step_is_worth_is_refused():
         make(DrQv2, intrinsic_reward=Silent)
     with pytest.raises(TypeError, match="reward"):
         Silent()
+
+
+@each
+@pytest.mark.parametrize("bad", [lambda _: -1.0, lambda _: float("nan"), lambda _: None, lambda: 1.0, lambda _: 1 / 0])
+def test_a_schedule_that_gives_no_rate_is_named(algorithm, policy, replay, method, bad):
+    with pytest.raises(ValueError, match="learning_rate must "):
+        make(algorithm, learning_rate=bad)
+    model = make(algorithm)
+    before = model.learning_rate
+    with pytest.raises(ValueError, match="learning_rate must "):
+        model.learning_rate = bad
+    assert model.learning_rate == before
+
+
+@each
+@pytest.mark.parametrize("later", [-1e-9, float("nan"), float("inf")])
+def test_a_schedule_that_ends_badly_changes_no_weights(algorithm, policy, replay, method, later):
+    model = make(algorithm, learning_rate=lambda left: 1e-3 if left > 0.5 else later)
+    with pytest.raises(ValueError, match=r"The schedule of .* must give non-negative numbers: with 0.* of the run left it"):
+        model.learn(60)
+    assert all(th.isfinite(weight).all() for weight in model.policy.parameters())

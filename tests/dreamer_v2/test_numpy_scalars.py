@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.number_checks import plain
 
 NUMBERS = {
@@ -27,14 +27,14 @@ NUMBERS = {
 
 def numpy_of(value):
     kinds = {bool: [np.bool_], int: [np.int32, np.int64, np.uint16], float: [np.float32, np.float64]}[type(value)]
-    return [kind(value) for kind in kinds if value < 2**15 or kind is not np.uint16]
+    return [kind(value) for kind in kinds if value < 2**15 or kind is not np.uint16] + [np.array(value)]
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_every_number_of_the_constructor(tiny_model, name):
     for value in numpy_of(NUMBERS[name]):
         found = tiny_model(**{name: value}, _init_setup_model=False).arguments()[name]
-        assert found == value and not isinstance(found, np.generic)
+        assert found == value and type(found) is type(NUMBERS[name])
 
 
 def test_a_model_of_numpys_numbers_learns_and_is_loaded(tiny_model, tmp_path):
@@ -53,6 +53,12 @@ def test_a_model_of_numpys_numbers_learns_and_is_loaded(tiny_model, tmp_path):
 def test_the_same_checks(tiny_model, name, value):
     with pytest.raises(ValueError, match=name):
         tiny_model(**{name: value})
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.array])
+def test_numbers_beside_the_constructor(tiny_model, kind):
+    tiny_model().set_random_seed(kind(3))
+    assert PhaseSwitchCallback(kind(7)).pretrain_frames == 7
 
 
 @given(st.recursive(st.one_of(st.integers(0, 9), st.text(), st.none()), lambda x: st.lists(x) | st.dictionaries(st.text(), x)))

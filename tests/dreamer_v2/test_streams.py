@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.envs import SupervisedVecEnv, worker
@@ -247,6 +247,27 @@ def test_an_episode_that_a_callback_ends_with_is_whole(tiny_model):
         model.learn(100, callback=StopTrainingOnMaxEpisodes(1), reset_num_timesteps=False)
     assert rows_of(model) == [(list(range(7)), True), (list(range(7, 11)), True), (list(range(11, 21)), True)]
     assert model._episode_num == len(model.ep_info_buffer) == 3
+
+
+class SilentEnd(VecEnvWrapper):
+    """Tells nobody the last observation of an episode, and gives lists."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observation, reward, done, infos = self.venv.step_wait()
+        return observation, reward.tolist(), done.tolist(), [{"TimeLimit.truncated": False} for _ in infos]
+
+
+def test_the_next_episodes_start_ends_no_episode(tiny_model):
+    env = SilentEnd(DummyVecEnv([lambda: TellingEnv(terminates=True)] * 2))
+    model = tiny_model(env, replay_buffer_kwargs={"sampling": "rows"})
+    with pytest.warns(UserWarning, match=r"without info\['terminal_observation'\]"):
+        model.learn(30)
+    frames, ends = zip(*rows_of(model), strict=True)
+    assert all(ends) and {one[-1] - one[-2] for one in frames} == {0}
+    assert all(np.diff(one[:-1]).tolist() == [1] * (len(one) - 2) for one in frames)
 
 
 def test_evaluating_in_the_models_own_environment_closes_the_stream(tiny_model):

@@ -83,6 +83,18 @@ class Raises(CounterEnv):
         return {}["steps"]
 
 
+class Shy:
+    def __repr__(self):
+        raise ValueError
+
+
+def test_a_value_without_a_text_is_called_by_its_class():
+    env = CounterEnv()
+    env.domain = Shy()
+    with pytest.warns(UserWarning, match="an object of the class Shy"):
+        assert env_fact(DummyVecEnv([lambda: env]), "domain", None) is None
+
+
 def unspeakable():
     env = Raises(20, task=threading.Lock())
     env.spec = gymnasium.envs.registration.EnvSpec("OfAFunction-v0", entry_point=lambda: None)

@@ -21,7 +21,7 @@ Where DreamerV2 deviates, and why:
 - ``load`` refuses keywords that are no constructor arguments; SB3 sets any as an attribute.
 - ``num_timesteps`` may overshoot by less than ``train_freq`` steps, as in SB3's other off-policy algorithms.
 - A Dict with one vector is not the same network as that vector alone: its encoder stands behind a name.
-- The identity environments that SB3 learns as a check are not learnt here, as sequences and imagination cost too much. What is
+- The identity environments that SB3 learns as a check are not learnt here: the preset that does takes minutes. What is
   learnt is checked by ``make test-slow`` and docs/results.md.
 - ``learning_starts`` counts steps of the phase, not of the call: a second ``learn`` does not warm up again.
 - Dict observations need ``MultiInputPolicy`` and images ``CnnPolicy`` or ``MlpPolicy`` (flattened), as in SB3.

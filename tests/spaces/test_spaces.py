@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -248,3 +249,37 @@ def test_planning_with_choices(tiny_model, planner):
     assert space.contains(action) and state[3].shape == (1, 3, 5) and math.isclose(state[3][0, 0, :2].sum(), 1, rel_tol=1e-5)
     again, _ = model.predict(observation, deterministic=True)
     assert np.array_equal(action, again)
+
+
+BYTES = {"low": 0, "high": 255, "dtype": np.uint8}
+MAYBE_IMAGES = {
+    "gray": spaces.Box(shape=(16, 16), **BYTES),
+    "film": spaces.Box(shape=(4, 16, 16, 3), **BYTES),
+    "floats, channels last": spaces.Box(0, 1, (16, 20, 3)),
+    "floats, channels first": spaces.Box(0, 1, (1, 16, 20)),
+}
+NO_IMAGES = {
+    "image": spaces.Box(shape=(16, 16, 3), **BYTES),
+    "bytes": spaces.Box(shape=(20,), **BYTES),
+    "heights": spaces.Box(-1, 1, (20, 20)),
+    "small": spaces.Box(-1, 1, (3, 4, 5)),
+    "class": spaces.Discrete(3),
+}
+
+
+@pytest.mark.parametrize("name", [*MAYBE_IMAGES, *NO_IMAGES])
+def test_what_may_be_meant_as_an_image_is_not_flattened_silently(tiny_model, name):
+    space = spaces.Dict(one={**MAYBE_IMAGES, **NO_IMAGES}[name], two=VECTOR)
+    env = CounterEnv(8, observation_space=space)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tiny_model(env, "MultiInputPolicy")
+    said = [str(one.message) for one in caught if "not as an image" in str(one.message)]
+    assert len(said) == (name in MAYBE_IMAGES)
+    assert all(text.startswith("Observation 'one' is seen as a vector of ") for text in said)
+
+
+@pytest.mark.parametrize("space", [spaces.Text(4), spaces.Sequence(spaces.Discrete(2))], ids=str)
+def test_observations_that_are_no_arrays_are_named(tiny_model, space):
+    with pytest.raises(ValueError, match=rf"arrays of numbers, .*got {type(space).__name__}"):
+        tiny_model(CounterEnv(8, observation_space=space), "MlpPolicy")
