@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import __version__
 
@@ -67,14 +68,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    try:
-        # Heavy imports only inside, so that --help answers at once.
-        if command in modules:
-            return int(modules[command].run(options))
-        return {"demo-pixels": _demo_pixels, "methods": _methods, "convert": _convert}[command](options)
-    except (ValueError, ImportError, FileNotFoundError) as error:
-        print(f"sb3-dreamer-urlb: {error}", file=sys.stderr)
-        return 2
+    others = {"demo-pixels": _demo_pixels, "methods": _methods, "convert": _convert}
+    # Heavy imports only inside, so that --help answers at once.
+    act = modules[command].run if command in modules else others[command]
+    return ending_in_a_line("sb3-dreamer-urlb", lambda: int(act(options)))
 
 
 def _demo_pixels(options: dict[str, Any]) -> int:

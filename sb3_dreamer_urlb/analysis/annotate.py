@@ -52,6 +52,30 @@ def about(model: Any, env: VecEnv, tuned: bool) -> Callable[[Row], bool]:
     return matches
 
 
+def check_has_rows(
+    path: str | os.PathLike[str], matches: Callable[[Row], bool], varied: tuple[str, ...] = OF_ONE_AGENT
+) -> None:
+    """Whether :func:`annotate` will know where to write, before anything is measured.
+
+    :param path: of the CSV file of evaluations
+    :param matches: which rows
+    :param varied: columns in which these rows may differ; in any other they are about several agents
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if no row matches (evaluate the fine-tuned agent first), or rows of several agents do
+    """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"There is no file {path} of evaluations: evaluate the fine-tuned agent first.")
+    settings = [dict(row.setting(*varied)) for row in read_rows(path, strict=False).rows if matches(row)]
+    if not settings:
+        raise ValueError(f"{path} has no row about this agent and task: evaluate the fine-tuned agent first.")
+    names = sorted({name for one in settings for name in one})
+    if differ := [name for name in names if len({one.get(name) for one in settings}) > 1]:
+        raise ValueError(
+            f"{path} has {len(settings)} rows that may be about this agent, and they differ in {', '.join(differ)}, which a "
+            "snapshot does not tell: keep the rows of this agent in a file of their own."
+        )
+
+
 def annotate(
     path: str | os.PathLike[str],
     matches: Callable[[Row], bool],
@@ -67,19 +91,8 @@ def annotate(
     :param value: to write
     :param varied: columns in which these rows may differ; in any other they are about several agents
     :return: how many rows have it now
-    :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if no row matches (evaluate the fine-tuned agent first), or rows of several agents do; the file is as
-        it was
+    :raises FileNotFoundError: see :func:`check_has_rows`
+    :raises ValueError: likewise; the file is as it was
     """
-    if not Path(path).exists():
-        raise FileNotFoundError(f"There is no file {path} of evaluations: evaluate the fine-tuned agent first.")
-    settings = [dict(row.setting(*varied)) for row in read_rows(path, strict=False).rows if matches(row)]
-    if not settings:
-        raise ValueError(f"{path} has no row about this agent and task: evaluate the fine-tuned agent first.")
-    names = sorted({name for one in settings for name in one})
-    if differ := [name for name in names if len({one.get(name) for one in settings}) > 1]:
-        raise ValueError(
-            f"{path} has {len(settings)} rows that may be about this agent, and they differ in {', '.join(differ)}, which a "
-            "snapshot does not tell: keep the rows of this agent in a file of their own."
-        )
+    check_has_rows(path, matches, varied)
     return change_rows(path, matches, {column: repr(float(value))})

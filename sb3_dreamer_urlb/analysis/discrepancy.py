@@ -76,12 +76,13 @@ def check_comparable(pretrained: DreamerV2, finetuned: DreamerV2) -> None:
         raise ValueError(
             f"The two models are of different sizes: {name} is {shapes[0].get(name)} before, {shapes[1].get(name)} after."
         )
-    _check_normalized_alike(pretrained, finetuned)
     if not all(th.equal(value, parts[1][name]) for name, value in parts[0].items() if name.startswith("decoder.")):
         raise ValueError(
-            "The decoder changed, so a latent state means something else after fine-tuning than before: fine-tune this very "
-            "snapshot with DreamerV2.load(snapshot, freeze_decoder=True)."
+            "The decoders differ, so a latent state means something else to each: either the second agent does not come from "
+            "this pre-training, or its decoder was not frozen. Fine-tune this very snapshot with DreamerV2.load(snapshot, "
+            "freeze_decoder=True)."
         )
+    _check_normalized_alike(pretrained, finetuned)
 
 
 def _check_normalized_alike(pretrained: DreamerV2, finetuned: DreamerV2) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sb3_dreamer_urlb.callbacks.snapshot import SNAPSHOT_FRAMES
 from sb3_dreamer_urlb.envs.registration import PRIMAL_TASK, URLB_TASKS, env_id
+from sb3_dreamer_urlb.intrinsic.registry import get_intrinsic_reward
 from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
 #: of the ablations (paper, §4): all that have an actor to keep
@@ -186,6 +187,8 @@ class Manifest:
     primal: bool = True
 
 
+#: studies with an arm that keeps the pre-trained actor, whatever the domain
+ABOUT_ACTORS = ("modules", "sparsity")
 _JACO = tuple(f"jaco-{task}" for task in URLB_TASKS["jaco"])
 MANIFESTS: dict[str, Manifest] = {
     "known-reward": Manifest(known_reward, Plan(), "known_reward", primal=False),
@@ -202,12 +205,17 @@ def runs_of(name: str, plan: Plan, scratch: bool = False) -> list[FineTuning]:
     :param name: of ``MANIFESTS``
     :param plan: what of it
     :param scratch: and beside it agents without pre-training
-    :raises ValueError: for an unknown name, or tasks that the study is not about
+    :raises ValueError: for an unknown name, tasks that the study is not about, or a method without an actor that it needs
     """
     if name not in MANIFESTS:
         raise ValueError(f"Unknown study {name!r}; known are {', '.join(MANIFESTS)}.")
     others: Sequence[str] = [task for task in plan.tasks if task not in _JACO] if name == "sparsity" else ()
     if others:
         raise ValueError(f"The study {name} is about Jaco: it has no {', '.join(others)}.")
+    untrained = [one for one in plan.methods if name in ABOUT_ACTORS and not get_intrinsic_reward(one).trains_actor]
+    if untrained:
+        raise ValueError(
+            f"The study {name} keeps pre-trained actors: {', '.join(untrained)} trains none. Leave it out of --methods."
+        )
     beside = from_scratch(plan, MANIFESTS[name].primal) if scratch else ()
     return list(dict.fromkeys([*MANIFESTS[name].runs(plan), *beside]))

@@ -16,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_dreamer_urlb.analysis.manifests import SCRATCH, FineTuning, PreTraining
+from sb3_dreamer_urlb.analysis.study_settings import PIXELS, check_same, remember
 from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
 from sb3_dreamer_urlb.callbacks.snapshot import SnapshotCallback
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -42,6 +43,14 @@ class StudyFolder:
     make_env: Callable[[str, int], VecEnv] = make_vec_env
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """What shapes every row of the folder, beside the runs' own names."""
+        known: dict[Any, str] = {make_vec_env: PIXELS, normalized_states: "state"}
+        name = f"{self.make_env.__module__}.{getattr(self.make_env, '__qualname__', type(self.make_env).__qualname__)}"
+        shaping = {name: value for name, value in self.arguments.items() if name != "device"}
+        return {**shaping, "episodes": self.episodes, "observation": known.get(self.make_env, name)}
+
+    @property
     def rows(self) -> Path:
         """One row for each finished run; its name is the column ``run_folder``."""
         return self.path / "rows.csv"
@@ -56,7 +65,12 @@ class StudyFolder:
         return {row["run_folder"] for row in rows}
 
     def missing(self, runs: Sequence[FineTuning]) -> list[FineTuning]:
-        """Those that have no row yet, in their order."""
+        """Those that have no row yet, in their order.
+
+        :param runs: of the study
+        :raises ValueError: if the folder holds runs of other settings
+        """
+        check_same(self.path, self.settings)
         done = self.finished()
         return [run for run in runs if run.name not in done]
 
@@ -133,9 +147,13 @@ class StudyFolder:
         :param minutes: begin none after so many
         :param at_most: fine-tunings
         :return: fine-tunings done
+        :raises ValueError: if the folder holds runs of other settings
         """
         end, count = time.monotonic() + 60 * minutes, 0
-        for run in self.missing(runs):
+        missing = self.missing(runs)
+        remember(self.path, self.settings)
+        awaited: list[str] = []
+        for run in missing:
             if time.monotonic() > end or count == at_most:
                 break
             with self._locked(run.start.name) as mine:
@@ -144,12 +162,19 @@ class StudyFolder:
                     self._check_there(run)
             if run.start.method != SCRATCH and not self.snapshot(run.start, run.length).exists():
                 # Another process is at it.
+                awaited.append(f"the pre-training {run.start.name}")
                 continue
             with self._locked(run.name) as mine:
-                if mine and run.name not in self.finished():
+                if not mine:
+                    awaited.append(run.name)
+                elif run.name not in self.finished():
                     self.finetune(run)
                     print(f"{run.name}: done", flush=True)
                     count += 1
+        if awaited:
+            print(f"Left to other processes, which are at it: {', '.join(dict.fromkeys(awaited))}. Start again after them.")
+        elif not missing:
+            print("Nothing is missing.")
         return count
 
     def _check_there(self, run: FineTuning) -> None:

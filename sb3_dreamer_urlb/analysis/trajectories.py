@@ -36,11 +36,13 @@ class Trajectory:
         (T + 1, …); by name for Dict spaces
     :param actions: as the environment received them, (T, …)
     :param rewards: of the task, float (T,)
+    :param name: of the file, for messages
     """
 
     observations: np.ndarray | dict[str, np.ndarray]
     actions: np.ndarray
     rewards: np.ndarray
+    name: str = ""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -165,7 +167,7 @@ def _load(path: Path) -> Trajectory:
         raise ValueError(f"{path} is no recorded episode: {error}") from error
     if lengths != {len(actions)} or len(actions) == 0:
         raise ValueError(f"{path} is no recorded episode: {len(actions)} actions with parts of {sorted(lengths)} steps.")
-    return Trajectory(seen, actions, rewards)
+    return Trajectory(seen, actions, rewards, str(path))
 
 
 # -- what a model takes ----------------------------------------------------------------------------------------------------
@@ -195,6 +197,31 @@ def check_fits(model: DreamerV2, trajectories: Sequence[Trajectory]) -> None:
         raise ValueError(f"The model sees {seen}, the trajectories hold {next(one for one in other if one != seen)}.")
     if any(shape != model.action_space.shape for shape in acted):
         raise ValueError(f"The model's actions are {model.action_space}, those of the trajectories have the shape {acted[0]}.")
+    for i, trajectory in enumerate(trajectories):
+        _check_values(model.action_space, trajectory, f"{trajectory.name or 'Trajectories'}, episode {i}")
+
+
+def _check_values(actions: spaces.Space[Any], trajectory: Trajectory, where: str) -> None:
+    """
+    :raises ValueError: naming the first row with a number that is not finite, or an action that the space does not hold
+    """
+    seen = trajectory.observations
+    parts = {f"{OBSERVATION} {name}": part for name, part in seen.items()} if isinstance(seen, dict) else {OBSERVATION: seen}
+    for name, part in {**parts, "action": trajectory.actions, "reward": trajectory.rewards}.items():
+        try:
+            wrong = ~np.isfinite(np.asarray(part)).reshape(len(part), -1).all(1)
+        except TypeError as error:
+            raise ValueError(f"{where}: its {name} holds no numbers, but {np.asarray(part).dtype}.") from error
+        if wrong.any():
+            raise ValueError(f"{where}, row {wrong.argmax()}: its {name} is not finite.")
+    if isinstance(actions, spaces.Box):
+        given, room = np.asarray(trajectory.actions, np.float64), 1e-4 * (1 + np.abs(actions.high) + np.abs(actions.low))
+        wrong = ((given < actions.low - room) | (given > actions.high + room)).reshape(len(given), -1).any(1)
+    else:
+        wrong = np.array([not actions.contains(np.asarray(one, actions.dtype)) for one in trajectory.actions])
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(f"{where}, row {row}: the action {trajectory.actions[row]} is none of {actions}.")
 
 
 def _shapes(seen: Any) -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,11 +65,42 @@ def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[An
     """
     from sb3_dreamer_urlb.evaluation.loading import algorithm_of
 
+    check_device(options["device"])
     path, env = _file(options["snapshot"]), environment_of(options, envs)
     try:
-        return algorithm_of(path).load(path, env=env, device=options["device"], **arguments), env
+        with _hinting_at_states(env):
+            return algorithm_of(path).load(path, env=env, device=options["device"], **arguments), env
     except BaseException:
         env.close()
+        raise
+
+
+def check_device(device: str) -> None:
+    """
+    :param device: of torch, or ``"auto"``
+    :raises ValueError: if there is none of that name
+    """
+    from stable_baselines3.common.utils import get_device
+
+    try:
+        get_device(device)
+    except RuntimeError as error:
+        raise ValueError(f"--device {device}: {str(error).splitlines()[0]}") from error
+
+
+@contextmanager
+def _hinting_at_states(env: VecEnv) -> Iterator[None]:
+    """What does not fit an environment of pictures may be an agent that sees states: say how it is given them."""
+    try:
+        yield
+    except ValueError as error:
+        shape = getattr(env.observation_space, "shape", None)
+        spec = getattr(env.unwrapped.envs[0], "spec", None) if hasattr(env.unwrapped, "envs") else None
+        makes_states = spec is not None and spec.id.startswith(("urlb/", "rwrl/"))
+        if makes_states and shape is not None and len(shape) == 3 and ("shape" in str(error) or "space" in str(error)):
+            raise ValueError(
+                f"{str(error).rstrip('.')}. An agent that sees states needs --env-kwargs observation=state."
+            ) from error
         raise
 
 
@@ -87,7 +120,8 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
     env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
     try:
         statistics = options.get("vec_normalize") or (beside(snapshot) if beside(snapshot).is_file() else None)
-        return normalized_as_saved(env, snapshot) if statistics is None else load_vec_normalize(statistics, env)
+        with _hinting_at_states(env):
+            return normalized_as_saved(env, snapshot) if statistics is None else load_vec_normalize(statistics, env)
     except BaseException:
         env.close()
         raise

@@ -36,8 +36,12 @@ def run(options: dict[str, Any]) -> int:
     groups: dict[str, list[Path]] = {}
     for text in options["runs"]:
         label, equals, folders = text.rpartition("=")
+        if not all(folder.strip() for folder in folders.split(",")) or (equals and not label.strip()):
+            raise ValueError(f"{text!r}: expected the folder of a run, or LABEL=FOLDER,FOLDER,...")
         paths = [Path(folder) for folder in folders.split(",")]
         groups.setdefault(label if equals else paths[0].resolve().name, []).extend(paths)
+    if options["out"].suffix.lower() in (".png", ".pdf"):
+        raise ValueError(f"--out {options['out']} is the page, compare.html say; its picture comes beside it under that name.")
     table, written = compare_runs(groups, options["out"], options.get("tag"))
     print(f"{table.text()}\nWrote {', '.join(map(str, written))}.")
     return 0
@@ -50,9 +54,13 @@ def compare_runs(groups: Mapping[str, Sequence[Path]], out: Path, tag: str | Non
     :param out: page
     :param tag: of the log; None takes the first of ``TAGS`` that all runs have
     :return: the table of last values, and the files that were written
-    :raises ValueError: for groups that share no log
+    :raises ValueError: for groups that share no log, or a run that stands in a group twice
     :raises FileNotFoundError: if there is no run in a folder
     """
+    for label, folders in groups.items():
+        there = [folder.resolve() for folder in folders]
+        if twice := sorted({str(folder) for folder in there if there.count(folder) > 1}):
+            raise ValueError(f"{label!r} has {', '.join(twice)} more than once: a run is one seed of its group.")
     from sb3_dreamer_urlb.evaluation.comparison import compare
     from sb3_dreamer_urlb.evaluation.run_facts import read_run
     from sb3_dreamer_urlb.evaluation.run_page import compare_page, embedded_png

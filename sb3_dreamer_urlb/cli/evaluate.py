@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 HELP = "evaluate a saved agent: episodes with fixed seeds, a row of a CSV file, evaluations.npz"
 BOTH = "both"
+#: columns of a row that nobody may set, with the result itself
+MEASURED = frozenset(("seconds", "planner", "evaluation_seed", "returns", "versions", "written"))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,11 +50,15 @@ def run(options: dict[str, Any]) -> int:
     import numpy as np
 
     from sb3_dreamer_urlb.evaluation.agent_rows import results_of, row_of
-    from sb3_dreamer_urlb.evaluation.append import append_row
+    from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
 
     envs = environments_at_a_time(options)
     about = {"snapshot": options["snapshot"], **_columns(options.get("set", ()))}
+    if "rows" in options:
+        check_can_append(options["rows"])
+    if "npz" in options:
+        options["npz"].mkdir(parents=True, exist_ok=True)
     model, env = load_agent(options, envs)
     if "rows" in options and model.seed is None and "seed" not in about:
         env.close()
@@ -72,27 +78,43 @@ def run(options: dict[str, Any]) -> int:
     finally:
         env.close()
     if "npz" in options:
-        options["npz"].mkdir(parents=True, exist_ok=True)
         np.savez(options["npz"] / "evaluations.npz", **results_of(evaluations[:1], [model.num_timesteps]))  # type: ignore[arg-type]
     return 0
 
 
 def _columns(texts: Any) -> dict[str, Any]:
-    from sb3_dreamer_urlb.evaluation.rows import REQUIRED
+    """What --set says, checked as a row is: nothing of it may be found wrong after the episodes."""
+    from dataclasses import replace
 
-    columns = {name: typed(text) if name in REQUIRED else text for name, text in pairs("--set", texts).items()}
+    from sb3_dreamer_urlb.evaluation.names import method_name
+    from sb3_dreamer_urlb.evaluation.rows import REQUIRED, RESULT, Row, parse
+    from sb3_dreamer_urlb.evaluation.rows import texts as written
+
+    given = pairs("--set", texts)
+    if clash := sorted(given.keys() & MEASURED.union(RESULT)):
+        raise ValueError(f"--set {', '.join(clash)}: the evaluation measures that; other columns may be set.")
+    columns = {name: typed(text) if name in REQUIRED else text for name, text in given.items()}
     for name in columns.keys() & {"keep_actor", "keep_critic"}:
         if columns[name] is not None and not isinstance(columns[name], bool):
             raise ValueError(f"--set {name}: expected true, false or none, got {columns[name]!r}.")
+    if "method" in columns:
+        columns["method"] = method_name(str(columns["method"]))
+    blank = Row("lbs", "walker", "run", 0, 0, 0, None, None, "none", "paper", 0.0, 0.0, 1)
+    required = {name: value for name, value in columns.items() if name in REQUIRED}
+    further = {name: value for name, value in columns.items() if name not in REQUIRED}
+    try:
+        parse(written(replace(blank, **required, further=further)), strict=False)
+    except ValueError as error:
+        raise ValueError(f"--set {error}") from error
     return columns
 
 
 def _print(options: dict[str, Any], played: Evaluation) -> None:
-    from sb3_dreamer_urlb.evaluation.names import TASKS, columns_of_id
+    from sb3_dreamer_urlb.evaluation.names import TASKS, columns_of_id, counted
     from sb3_dreamer_urlb.evaluation.scores import normalized_score
 
     who = "actor alone" if played.planner == "none" else f"planner {played.planner}"
-    line = f"{options['env']}, {who}: return {played.mean:.1f} ± {played.std:.1f} ({len(played.returns)} episodes"
+    line = f"{options['env']}, {who}: return {played.mean:.1f} ± {played.std:.1f} ({counted(len(played.returns), 'episode')}"
     name = "{domain}-{task}".format(**columns_of_id(options["env"]))
     score = f", {100 * normalized_score(name, played.mean):.1f} % of Dreamer@2M" if name in TASKS else ""
     print(f"{line}, {played.seconds:.0f} s){score}")

@@ -35,6 +35,7 @@ def run(options: dict[str, Any]) -> int:
 
     from sb3_dreamer_urlb.analysis.actor_trial import try_actor
     from sb3_dreamer_urlb.cli.agents import load_agent
+    from sb3_dreamer_urlb.evaluation.names import counted
     from sb3_dreamer_urlb.number_checks import check_integer
     from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
@@ -45,7 +46,7 @@ def run(options: dict[str, Any]) -> int:
     finally:
         env.close()
     for name, returns in (("pre-trained", trial.pretrained), ("fresh", trial.fresh)):
-        print(f"  {name} actor: return {np.mean(returns):.1f} ± {np.std(returns):.1f} ({len(returns)} episodes)")
+        print(f"  {name} actor: return {np.mean(returns):.1f} ± {np.std(returns):.1f} ({counted(len(returns), 'episode')})")
     rule = "keep" if keeps_actor(model.domain) else "drop"
     print(f"{'keep' if trial.keep else 'drop'} the actor, after {trial.frames} frames; the paper's rule by domains: {rule}")
     return 0

@@ -28,20 +28,38 @@ def add_oracle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 
+def check_oracle_options(options: dict[str, Any]) -> None:
+    """Everything about the oracle and the destinations that can be told before anything is loaded or played.
+
+    :param options: of the command line
+    :raises ValueError: if neither an oracle nor a folder is given, or a file of rows is none
+    :raises OSError: if something is not there, or cannot be written
+    """
+    from sb3_dreamer_urlb.evaluation.append import check_can_append
+    from sb3_dreamer_urlb.number_checks import check_integer
+
+    check_integer("--count", options["count"], 1)
+    check_integer("--seed", options["seed"], 0)
+    if "oracle" not in options and "trajectories" not in options:
+        raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
+    if "oracle" in options and "trajectories" in options:
+        options["trajectories"].mkdir(parents=True, exist_ok=True)
+    if "rows" in options:
+        if not options["rows"].exists():
+            raise FileNotFoundError(f"There is no file {options['rows']} of evaluations: evaluate the fine-tuned agent first.")
+        check_can_append(options["rows"])
+
+
 def trajectories_of(options: dict[str, Any]) -> list[Trajectory]:
     """What the oracle plays, or played.
 
     :param options: of the command line
-    :raises ValueError: if neither an oracle nor a folder is given, or too few episodes are there
+    :raises ValueError: if too few episodes are there
     """
     from sb3_dreamer_urlb.analysis.trajectories import load_trajectories, play_trajectories, save_trajectories
     from sb3_dreamer_urlb.cli.agents import load_agent
-    from sb3_dreamer_urlb.number_checks import check_integer
 
-    check_integer("--count", options["count"], 1)
     if "oracle" not in options:
-        if "trajectories" not in options:
-            raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
         return load_trajectories(options["trajectories"], options["count"])
     its = {**options, "snapshot": options["oracle"], "vec_normalize": options.get("oracle_vec_normalize")}
     oracle, env = load_agent(its, min(options["count"], 10))
@@ -49,8 +67,11 @@ def trajectories_of(options: dict[str, Any]) -> list[Trajectory]:
         played = play_trajectories(oracle, env, options["count"], options["seed"])
     finally:
         env.close()
+    from sb3_dreamer_urlb.evaluation.names import counted
+
     returns = [float(one.rewards.sum()) for one in played]
-    print(f"{options['oracle']}: {len(played)} trajectories, return {sum(returns) / len(returns):.1f}")
+    trajectories = counted(len(played), "trajectory", "trajectories")
+    print(f"{options['oracle']}: {trajectories}, return {sum(returns) / len(returns):.1f}")
     if "trajectories" in options:
         save_trajectories(played, options["trajectories"])
     return played
@@ -62,8 +83,10 @@ def print_values(what: str, values: list[float]) -> float:
     :param what: was measured
     :param values: one a trajectory
     """
+    from sb3_dreamer_urlb.evaluation.names import counted
+
     for i, value in enumerate(values):
         print(f"  trajectory {i:3d}: {value:.6g}")
     mean = sum(values) / len(values)
-    print(f"{what}: {mean:.6g} (mean of {len(values)} trajectories)")
+    print(f"{what}: {mean:.6g} (mean of {counted(len(values), 'trajectory', 'trajectories')})")
     return mean

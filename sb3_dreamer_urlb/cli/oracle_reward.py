@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from sb3_dreamer_urlb.cli.oracle import add_oracle_arguments, print_values, trajectories_of
+from sb3_dreamer_urlb.cli.oracle import add_oracle_arguments, check_oracle_options, print_values, trajectories_of
 
 HELP = "how interesting a pre-trained agent finds an oracle's trajectories"
 
@@ -26,19 +26,23 @@ def run(options: dict[str, Any]) -> int:
     :raises ValueError: for a model without an intrinsic reward, or too few trajectories
     :raises FileNotFoundError: if there is no such snapshot, folder or file
     """
-    from sb3_dreamer_urlb.analysis.annotate import FROM_ONE_PRETRAINING, INTRINSIC_REWARD, about, annotate
+    from sb3_dreamer_urlb.analysis.annotate import FROM_ONE_PRETRAINING, INTRINSIC_REWARD, about, annotate, check_has_rows
     from sb3_dreamer_urlb.analysis.novelty import check_has_intrinsic_reward, intrinsic_reward_on
     from sb3_dreamer_urlb.cli.agents import load_agent
+    from sb3_dreamer_urlb.evaluation.names import counted
 
+    check_oracle_options(options)
     model, env = load_agent(options, 1)
     try:
         check_has_intrinsic_reward(model)
+        matches = about(model, env, tuned=True)
+        if "rows" in options:
+            check_has_rows(options["rows"], matches, FROM_ONE_PRETRAINING)
         values = intrinsic_reward_on(model, trajectories_of(options), options["seed"])
         mean = print_values(f"Intrinsic reward of {model.intrinsic_reward}", values)
         if "rows" in options:
-            matches = about(model, env, tuned=True)
             count = annotate(options["rows"], matches, INTRINSIC_REWARD, mean, FROM_ONE_PRETRAINING)
-            print(f"  column {INTRINSIC_REWARD} of {count} rows of {options['rows']}")
+            print(f"  column {INTRINSIC_REWARD} of {counted(count, 'row')} of {options['rows']}")
     finally:
         env.close()
     return 0

@@ -51,10 +51,18 @@ def run(options: dict[str, Any]) -> int:
 
     from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, runs_of
     from sb3_dreamer_urlb.analysis.study import StudyFolder, normalized_states
+    from sb3_dreamer_urlb.cli.agents import check_device
+    from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
     from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
     from sb3_dreamer_urlb.number_checks import check_integer
 
     check_integer("--episodes", options["episodes"], 1)
+    if "at_most" in options:
+        check_integer("--at-most", options["at_most"], 1)
+    if not options["minutes"] > 0:
+        raise ValueError(f"--minutes must be more than 0, got {options['minutes']}.")
+    check_device(options["device"])
+    get_preset(options["preset"])
     given: dict[str, Any] = {name.removesuffix("_frames"): options[name] for name in PLANNED if name in options}
     manifest = MANIFESTS[options["name"]]
     given = {name: tuple(one) if isinstance(one, list) else one for name, one in given.items()}
@@ -71,5 +79,8 @@ def run(options: dict[str, Any]) -> int:
             print("missing" if one in missing else "done   ", one.name)
         print(f"{len(runs) - len(missing)} of {len(runs)} done; figure {manifest.figure} of `figures {study.rows}`")
         return 0
-    study.work(runs, options["minutes"], options.get("at_most"))
+    try:
+        study.work(runs, options["minutes"], options.get("at_most"))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted; the same command goes on where it was.") from None
     return 0

@@ -51,14 +51,21 @@ def run(options: dict[str, Any]) -> int:
     """
     from sb3_dreamer_urlb.analysis.zero_shot import check_pretrained, prepare_zero_shot
     from sb3_dreamer_urlb.evaluation.agent_rows import row_of
-    from sb3_dreamer_urlb.evaluation.append import append_row
+    from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
+    from sb3_dreamer_urlb.evaluation.names import counted
     from sb3_dreamer_urlb.number_checks import check_integer
 
     envs = environments_at_a_time(options)
     check_integer("--finetune-frames", options["finetune_frames"], 0)
     if options["finetune_frames"] == 0 and (options["freeze_decoder"] or "save" in options):
         raise ValueError("--freeze-decoder and --save need --finetune-frames.")
+    if "rows" in options:
+        check_can_append(options["rows"])
+    if "save" in options:
+        options["save"].parent.mkdir(parents=True, exist_ok=True)
+        if options["save"].is_dir():
+            raise ValueError(f"--save {options['save']} is a folder: give a file.")
     first, env = load_agent(options, envs)
     env.close()
     check_pretrained(first)
@@ -70,7 +77,8 @@ def run(options: dict[str, Any]) -> int:
         env = environment_of(options, envs)
         played = run_evaluation(model, env, options["episodes"], options["seed"], "on")
         how = "fine_tuned" if frames else "zero_shot"
-        print(f"{options['env']}, {how}: return {played.mean:.1f} ± {played.std:.1f} ({len(played.returns)} episodes)")
+        episodes = counted(len(played.returns), "episode")
+        print(f"{options['env']}, {how}: return {played.mean:.1f} ± {played.std:.1f} ({episodes})")
         if "rows" in options:
             columns = {"adaptation": how, "known_reward": "true", "snapshot": options["snapshot"]}
             append_row(options["rows"], row_of(model, env, played, keep_actor=False, **columns))

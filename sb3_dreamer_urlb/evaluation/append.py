@@ -18,6 +18,26 @@ class RowsDisagree(ValueError):
     """Another result of the same run stands in the file already."""
 
 
+def check_can_append(path: str | os.PathLike[str]) -> None:
+    """Whether rows can be added to a file, before hours are spent on them. Its folder is made if it is not there.
+
+    :param path: of the CSV file, there or not
+    :raises ValueError: if it holds no rows
+    :raises OSError: if it cannot be written
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: give a CSV file for the rows.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _locked(path):
+        if path.exists():
+            # Not "w": what is there stays.
+            with open(path, "ab"):
+                content = path.read_bytes()
+            if content:
+                header(lines_of(content, "replace")[0], path)
+
+
 def append_row(path: str | os.PathLike[str], row: Row) -> bool:
     """Add a row to a file, made if it is not there.
 

@@ -34,11 +34,18 @@ def compare(
         lacking = [str(run.folder) for _, run in runs if not any(run.series.get(name) for name in wanted)]
         raise ValueError(f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}.")
     name = shared[0]
+    unknown = [str(run.folder) for _, run in runs if run.action_repeat is None]
+    if unknown and len(unknown) < len(runs):
+        raise ValueError(
+            f"How many environment frames a step has is known of some runs only, not of {', '.join(unknown)}, whose snapshots "
+            "cannot be read: their curves cannot stand over the same frames."
+        )
+    unit = "agent steps" if unknown else "environment frames"
     figure, [axes] = new_figure(1, COLUMN * 1.4, 2.3)
     table = Table(
         "comparison",
         f"{name} at the end of the shorter runs, mean ± standard error of the seeds.",
-        ["", name, "frames", "seeds"],
+        ["", name, unit.split()[-1], "seeds"],
     )
     handles = []
     for i, (label, members) in enumerate(groups.items()):
@@ -46,17 +53,17 @@ def compare(
         handles += lines(axes, {label: points}, {at: float(at) for at in points}, 1, band=True, first=i)
         for run in members:
             if run.switch is not None:
-                axes.axvline(run.switch * run.action_repeat, color="#999999", ls=":", lw=0.8, zorder=1)
+                axes.axvline(run.switch * (run.action_repeat or 1), color="#999999", ls=":", lw=0.8, zorder=1)
         last = max(points)
         table.lines.append([label, with_error(points[last], digits=1), frames_label(last), str(len(members))])
     what = IN_WORDS.get(name, name)
-    axes.set(xlabel="environment frames", ylabel=what)
+    axes.set(xlabel=unit, ylabel=what)
     axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
     counts = ", ".join(f"{label}: {len(members)}" for label, members in groups.items())
     switched = " Dotted: fine-tuning begins." if any(run.switch is not None for _, run in runs) else ""
     one = " One seed has no band." if any(len(members) == 1 for members in groups.values()) else ""
     caption = (
-        f"{what[0].upper()}{what[1:]} ({name}) over environment frames; bands: mean ± standard error of the seeds "
+        f"{what[0].upper()}{what[1:]} ({name}) over {unit}; bands: mean ± standard error of the seeds "
         f"({counts}).{one}{switched}"
     )
     return finish("comparison", figure, caption, False, handles, 2), table, _settings(groups)
@@ -64,7 +71,7 @@ def compare(
 
 def _mean_curve(members: Sequence[RunFacts], name: str) -> dict[int, Estimate]:
     """Over the frames that all runs of a group have come to."""
-    curves = [np.array(run.series[name], float) * (run.action_repeat, 1) for run in members]
+    curves = [np.array(run.series[name], float) * (run.action_repeat or 1, 1) for run in members]
     begin, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
     if begin > end:
         raise ValueError(f"{', '.join(str(run.folder) for run in members)} have no frames in common.")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
+import re
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_dreamer_urlb.evaluation.agent_rows import FROM_SCRATCH
+from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 
 #: a snapshot of each of these names is looked for, in this order; then the newest zip
@@ -33,7 +37,7 @@ class RunFacts:
     :param system: on which it was saved
     :param series: tag of the log → (agent steps, value)
     :param films: what is shown → GIF
-    :param rows: of evaluations
+    :param rows: of evaluations; of this run where its snapshot says what it is
     :param notes: what could not be read, and why
     """
 
@@ -57,27 +61,31 @@ class RunFacts:
         return dict(self.data.get("counters", {}))
 
     @property
-    def action_repeat(self) -> int:
-        """Environment frames an agent step."""
-        return int(self.counters.get("action_repeat", 1))
+    def action_repeat(self) -> int | None:
+        """Environment frames an agent step, by the snapshot or else by the log; None if neither can be read."""
+        if "action_repeat" in self.counters:
+            return int(self.counters["action_repeat"])
+        # Until fine-tuning begins, both count from the same step.
+        ratios = [frames / step for step, frames in self.series.get("time/phase_frames", [])[:1] if step > 0]
+        return round(ratios[0]) if ratios and ratios[0] >= 1 and ratios[0] == round(ratios[0]) else None
 
     @property
     def switch(self) -> float | None:
         """Agent steps at which fine-tuning began; None without both phases in this run."""
         frames = self.counters.get("pretrained_frames", 0)
         if frames:
-            return None if self.begins_with_fine_tuning else float(frames / self.action_repeat)
+            return None if self.begins_with_fine_tuning else float(frames / (self.action_repeat or 1))
         points = self.series.get("time/phase_frames", [])
         for (_, before), (step, after) in pairwise(points):
             if after < before:
-                return step - after / self.action_repeat
+                return step - after / (self.action_repeat or 1)
         return None
 
     @property
     def begins_with_fine_tuning(self) -> bool:
         """Whether the pre-training was another run: the steps that this one counts are those of its fine-tuning."""
         counters = self.counters
-        before = counters.get("num_timesteps", 0) * self.action_repeat - counters.get("phase_frames", 0)
+        before = counters.get("num_timesteps", 0) * (self.action_repeat or 1) - counters.get("phase_frames", 0)
         pretrained = counters.get("pretrained_frames", 0)
         return bool(pretrained and before < pretrained / 2)
 
@@ -100,12 +108,14 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
     :param folder: a run folder, the demo's, or any with a snapshot or logs in it
     :param rows: files of evaluations beside those in the folder
     :raises FileNotFoundError: if there is no such folder, or nothing of a run in it
+    :raises ValueError: if it holds several runs
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder of a run.")
     facts = RunFacts(folder)
     _read_snapshot(facts)
     _read_logs(facts)
+    facts.notes += damaged_files(folder)
     for kind in (AGENT, OPEN_LOOP):
         films = sorted(folder.rglob(f"{kind}*.gif"), key=lambda path: path.stat().st_mtime)
         films = [path for path in films if path.stat().st_size <= MAX_FILM_BYTES]
@@ -120,7 +130,13 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         except ValueError as error:
             facts.notes.append(str(error))
             continue
-        facts.rows += read.rows
+        own = [row for row in read.rows if _is_about(row, facts)]
+        if len(own) < len(read.rows):
+            others = counted(len(read.rows) - len(own), "row is", "rows are")
+            facts.notes.append(
+                f"{path}: {others} about other runs and left out (another method, domain, seed, size or length)."
+            )
+        facts.rows += own
         facts.notes += read.report().splitlines()
     if facts.snapshot is None and not facts.series:
         raise FileNotFoundError(f"{folder} holds neither a snapshot nor logs of a run.")
@@ -132,7 +148,7 @@ def _read_snapshot(facts: RunFacts) -> None:
 
     named = [facts.folder / name for name in SNAPSHOTS]
     others = sorted(facts.folder.glob("*.zip"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for path in [*named, *others]:
+    for path in dict.fromkeys([*named, *others]):
         if not path.is_file():
             continue
         try:
@@ -143,16 +159,67 @@ def _read_snapshot(facts: RunFacts) -> None:
             facts.notes.append(str(error))
 
 
+def _is_about(row: Row, facts: RunFacts) -> bool:
+    """Whether a row may be about the run, by what its snapshot says; True where there is no snapshot to ask."""
+    if not facts.data:
+        return True
+    arguments, counters = facts.arguments, facts.counters
+    reward, frames = arguments.get("intrinsic_reward"), int(counters.get("phase_frames", 0))
+    exploring = facts.data.get("phase") == "pretraining"
+    pretrained = frames if exploring else int(counters.get("pretrained_frames", 0))
+    method = {reward} if isinstance(reward, str) else {row.method} if reward else {*FROM_SCRATCH.values()}
+    early = row.finetune_frames == 0 and row.pretrain_frames <= pretrained
+    length = early or (row.pretrain_frames == pretrained and row.finetune_frames <= (0 if exploring else frames))
+    # Rows and snapshots of others may leave these out.
+    pairs = (
+        (row.seed, arguments.get("seed")),
+        (row.domain, facts.data.get("domain")),
+        (row.preset, arguments.get("preset")),
+        *((row[f"keep_{part}"], kept) for part, kept in (facts.data.get("kept") or {}).items() if part != "reward"),
+    )
+    same = all(one == other for one, other in pairs if one not in (None, "") and isinstance(other, str | int))
+    return length and row.method in method and same
+
+
+def _log_folders(folder: Path, name: str) -> list[Path]:
+    """Folders of one run that hold a log: the run's own, or else the one below, or those that a logger numbers.
+
+    :raises ValueError: where runs lie beside each other
+    """
+    if any(folder.glob(name)):
+        return [folder]
+    found = sorted({path.parent for path in folder.rglob(name)})
+    runs = {path.parent / re.sub(r"_\d+$", "", path.name) for path in found}
+    if len(runs) > 1:
+        raise ValueError(f"{folder} holds several runs, not one: name one of {', '.join(map(str, found))}.")
+    return found
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """What lies in the folder of a run and cannot be read, a line each.
+
+    :param folder: of the run
+    """
+    found = []
+    for path in sorted(folder.glob("*monitor.csv")):
+        first, columns, *lines = [*path.read_text(encoding="utf-8", errors="replace").splitlines(), "", ""]
+        if not first.startswith("#{") or not {"r", "l", "t"} <= set(columns.split(",")):
+            found.append(f"{path.name} is damaged: it is no log of Stable-Baselines3's Monitor.")
+        elif bad := sum(bool(line) and None in map(_number, line.split(",")[:3]) for line in lines):
+            found.append(f"{path.name} is damaged: {counted(bad, 'line')} of it cannot be read.")
+    for path in sorted(folder.glob("*.vec_normalize.json")):
+        try:
+            if not isinstance(json.loads(path.read_bytes()).get("statistics"), dict):
+                raise ValueError("it holds no statistics")
+        except (ValueError, AttributeError) as error:
+            found.append(f"{path.name} is damaged: {error}.")
+    return found
+
+
 def _read_logs(facts: RunFacts) -> None:
-    for path in sorted(facts.folder.rglob("progress.csv")):
-        with open(path, newline="", encoding="utf-8", errors="replace") as file:
-            for line in csv.DictReader(file):
-                step = _number(line.get("time/total_timesteps"))
-                for tag, text in line.items():
-                    value = _number(text)
-                    if tag and step is not None and value is not None:
-                        facts.series.setdefault(tag, []).append((step, value))
-    folders = sorted({path.parent for path in facts.folder.rglob("events.out.tfevents.*")})
+    for folder in _log_folders(facts.folder, "progress.csv"):
+        _read_progress(facts, folder / "progress.csv")
+    folders = _log_folders(facts.folder, "events.out.tfevents.*")
     if facts.series or not folders:
         return
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
@@ -165,6 +232,25 @@ def _read_logs(facts: RunFacts) -> None:
             facts.series.setdefault(tag, []).extend(points)
     for points in facts.series.values():
         points.sort()
+
+
+def _read_progress(facts: RunFacts, path: Path) -> None:
+    bad = 0
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        # A line that holds a null byte ends the reading of a file.
+        lines = csv.DictReader(line.replace("\0", "\N{REPLACEMENT CHARACTER}") for line in file)
+        for line in lines:
+            step = _number(line.get("time/total_timesteps"))
+            # More fields than columns stand under no name.
+            bad += step is None or None in line
+            for tag, text in line.items():
+                value = _number(text)
+                if tag and step is not None and value is not None:
+                    facts.series.setdefault(tag, []).append((step, value))
+        empty = not lines.fieldnames
+    if bad or empty:
+        what = "it is empty" if empty else f"{counted(bad, 'line')} of it cannot be read"
+        facts.notes.append(f"{path.relative_to(facts.folder)} is damaged: {what}.")
 
 
 def _number(text: Any) -> float | None:

@@ -47,6 +47,7 @@ def run_page(facts: RunFacts, command: str | None = None) -> str:
         facts=facts,
         summary=_summary(facts),
         charts=_charts(facts.series, facts.switch, facts.action_repeat),
+        whose=bool(facts.data),
         films={FILMS[kind]: _embedded(path.read_bytes(), "image/gif") for kind, path in facts.films.items()},
         evaluations=[_evaluation(row) for row in facts.rows],
         configuration=sorted(((name, _shown(value)) for name, value in facts.arguments.items()), key=lambda pair: pair[0]),
@@ -95,6 +96,7 @@ def _evaluation(row: Any) -> dict[str, str]:
     task = f"{row.domain}-{row.task}"
     known = task in TASKS
     return {
+        "run": f"{row.method}, {row.seed}",
         "task": task,
         "frames": f"{frames_label(row.pretrain_frames)} + {frames_label(row.finetune_frames)}",
         "planner": row.planner,
@@ -128,7 +130,7 @@ def _shown(value: Any) -> str:
 # -- pictures inside the page ------------------------------------------------------------------------------------------
 
 
-def _charts(series: Mapping[str, Series], switch: float | None, repeat: int) -> dict[str, list[str]]:
+def _charts(series: Mapping[str, Series], switch: float | None, repeat: int | None) -> dict[str, list[str]]:
     charts: dict[str, list[str]] = {}
     for heading, beginnings in CHARTS.items():
         tags = [tag for tag in series if tag.startswith(beginnings) and len(series[tag]) > 1]
@@ -137,14 +139,15 @@ def _charts(series: Mapping[str, Series], switch: float | None, repeat: int) -> 
     return charts
 
 
-def chart(series: Mapping[str, Series], title: str, switch: float | None = None, repeat: int = 1) -> str:
+def chart(series: Mapping[str, Series], title: str, switch: float | None = None, repeat: int | None = 1) -> str:
     """Lines over environment frames as SVG, to stand in a page.
 
     :param series: label → (agent steps, value)
     :param title: above it
     :param switch: agent steps at which the phase changes, marked
-    :param repeat: frames an agent step
+    :param repeat: frames an agent step; None, if nobody knows, draws over agent steps
     """
+    unit, repeat = ("agent steps", 1) if repeat is None else ("environment frames", repeat)
     check_matplotlib_installed()
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -165,7 +168,7 @@ def chart(series: Mapping[str, Series], title: str, switch: float | None = None,
             where, side = ((-3, -9), "right") if late else ((3, -9), "left")
             axes.annotate("fine-tuning", (repeat * switch, 1), xycoords=("data", "axes fraction"), xytext=where,
                           textcoords="offset points", ha=side, color="#D55E00", fontsize=8)  # fmt: skip
-        axes.set(title=title, xlabel="environment frames")
+        axes.set(title=title, xlabel=unit)
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
         if len(series) > 1:
             axes.legend()

@@ -39,6 +39,8 @@ RC: dict[Any, Any] = {
     "lines.linewidth": 1.4,
     "lines.markersize": 4,
     "hatch.linewidth": 0.5,
+    # Labels are people's own: a dollar is a dollar.
+    "text.parse_math": False,
     # letters stay letters
     "pdf.fonttype": 42,
 }

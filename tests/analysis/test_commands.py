@@ -19,7 +19,7 @@ from sb3_dreamer_urlb.analysis.trajectories import load_trajectories
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
-from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 from sb3_dreamer_urlb.hub import load_vec_normalize, save_vec_normalize
 
 SMALL = ("--episodes", "1", "--device", "cpu")
@@ -99,6 +99,58 @@ def test_neither_oracle_nor_folder(snapshots, tuned, capsys):
 def test_options_that_ask_for_nothing(snapshots, capsys):
     assert main(["zero-shot", str(snapshots()), "--env", ENV, "--freeze-decoder", *SMALL]) == 2
     assert "need --finetune-frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--rows {folder}", "is a folder"),
+        ("--rows {other}", "lacks the columns"),
+        ("--npz {other}", "File exists"),
+        ("--rows {folder}/rows.csv --set method=xyz", "unknown method 'xyz'"),
+        ("--rows {folder}/rows.csv --set return_mean=900", "--set return_mean: the evaluation measures that"),
+        ("--rows {folder}/rows.csv --set planner=mppi", "--set planner: the evaluation measures that"),
+        ("--rows {folder}/rows.csv --set seed=-1", "--set seed='-1'"),
+        ("--rows {folder}/rows.csv --set ldd=much", "--set ldd='much'"),
+        ("--device foo", "--device foo"),
+        ("--env urlb/walker-fly-v0", "walker-fly"),
+        ("--env=", "Malformed environment ID"),
+        ("--env urlb/walker-run-v0", "needs --env-kwargs observation=state"),
+    ],
+)
+def test_an_evaluation_that_will_fail_is_not_played(tuned, tmp_path, capsys, monkeypatch, options, said):
+    from sb3_dreamer_urlb.evaluation import episodes
+
+    monkeypatch.setattr(episodes, "run_evaluation", lambda *a, **k: pytest.fail("played"))
+    (tmp_path / "other.csv").write_text("a;b\n")
+    own = options.format(folder=tmp_path, other=tmp_path / "other.csv").split()
+    assert main(["evaluate", str(tuned), "--env", ENV, *SMALL, *own]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "rows.csv").exists()
+
+
+def test_an_oracle_does_not_play_for_nothing(snapshots, tuned, tmp_path, capsys, monkeypatch):
+    from sb3_dreamer_urlb.analysis import trajectories
+
+    monkeypatch.setattr(trajectories, "play_trajectories", lambda *a, **k: pytest.fail("played"))
+    rows = tmp_path / "rows.csv"
+    options = ["--env", ENV, "--oracle", str(tuned), "--device", "cpu", "--rows", str(rows)]
+    for command in (["discrepancy", str(snapshots()), str(tuned)], ["oracle-reward", str(snapshots())]):
+        rows.unlink(missing_ok=True)
+        assert main([*command, *options]) == 2
+        assert "no file" in capsys.readouterr().err
+        rows.write_text("a;b\n")
+        assert main([*command, *options]) == 2
+        assert "lacks the columns" in capsys.readouterr().err
+        rows.unlink()
+        append_rows(rows, [Row("icm", "walker", "run", 0, 56, 56, True, False, "none", "tiny", 1.0, 0.0, 1)])
+        assert main([*command, *options]) == 2
+        assert "no row about this agent" in capsys.readouterr().err
+
+
+def test_one_episode_is_one_episode(tuned, tmp_path, capsys):
+    assert main(["evaluate", str(tuned), "--env", ENV, *SMALL]) == 0
+    assert "(1 episode," in capsys.readouterr().out
 
 
 def test_only_the_rows_of_this_agent_are_written_to(snapshots, tuned, tmp_path):

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import torch as th
 import torch.nn.functional as F
-from counter_task import ENV, STEPS
+from counter_task import ENV, STATES, STEPS
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.analysis.discrepancy import latent_dynamics_discrepancy
+from sb3_dreamer_urlb.analysis.discrepancy import check_comparable, latent_dynamics_discrepancy
+from sb3_dreamer_urlb.analysis.novelty import intrinsic_reward_on
 from sb3_dreamer_urlb.analysis.trajectories import (
     Trajectory,
     as_batch,
@@ -117,6 +119,39 @@ def test_models_that_cannot_be_compared(snapshots, tuned, trajectories):
     ):
         with pytest.raises(ValueError, match=said):
             latent_dynamics_discrepancy(before, after, trajectories)
+
+
+@pytest.mark.parametrize(
+    ("part", "row", "value", "said"),
+    [
+        ("observation", 3, np.nan, "row 3: its observation is not finite"),
+        ("action", 2, np.inf, "row 2: its action is not finite"),
+        ("reward", 1, np.nan, "row 1: its reward is not finite"),
+        ("action", 4, 1e6, r"row 4: the action .* is none of Box"),
+        ("action", 0, -1.5, r"row 0: the action .* is none of Box"),
+    ],
+)
+def test_impossible_episodes_give_no_number(snapshots, tuned, trajectories, tmp_path, part, row, value, said):
+    save_trajectories(trajectories[:2], tmp_path)
+    path = tmp_path / "episode-0001.npz"
+    with np.load(path) as file:
+        content = {name: np.array(file[name], np.float32) for name in file.files}
+    content[part][row] = value
+    np.savez(path, **content)
+    before, after = (DreamerV2.load(file, device="cpu") for file in (snapshots(), tuned))
+    loaded = load_trajectories(tmp_path, 2)
+    for act in (lambda: latent_dynamics_discrepancy(before, after, loaded), lambda: intrinsic_reward_on(before, loaded)):
+        with pytest.raises(ValueError, match=rf"episode-0001\.npz, episode 1, {said}"):
+            act()
+
+
+def test_agents_of_two_pre_trainings_are_told_so():
+    one, other = (
+        DreamerV2("MlpPolicy", VecNormalize(make_vec_env(STATES, 1)), preset="tiny", device="cpu", seed=seed).learn(4)
+        for seed in (0, 1)
+    )
+    with pytest.raises(ValueError, match="does not come from this pre-training, or its decoder was not frozen"):
+        check_comparable(one, other)
 
 
 def test_trajectories_of_another_task(snapshots, tuned, trajectories):

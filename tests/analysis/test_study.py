@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium
 import pytest
 from counter_task import ENV, STATES
@@ -10,9 +12,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, Plan, runs_of
-from sb3_dreamer_urlb.analysis.study import StudyFolder
+from sb3_dreamer_urlb.analysis.study import StudyFolder, normalized_states
+from sb3_dreamer_urlb.analysis.study_settings import remember
 from sb3_dreamer_urlb.cli.study import NAMES
-from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.append import append_rows
+from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 
 SMALL = {"seeds": 1, "methods": ("lbs",), "tasks": ("walker-run",), "pretrain": (40, 56), "finetune": 48}
@@ -128,6 +132,59 @@ def test_a_study_from_normalised_states(tmp_path):
     assert ended - begun == pytest.approx(begun + 4, abs=6) and begun >= 20
     [alone] = [run for run in runs if run.start.method == "scratch"]
     assert beside(tmp_path / "tuned" / f"{alone.name}.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"arguments": {"preset": "small"}}, "preset='tiny', and preset='small' is asked for"),
+        ({"arguments": {"preset": "tiny", "learning_starts": 12, "batch_size": 4}}, "batch_size=None"),
+        ({"episodes": 3}, "episodes=1, and episodes=3"),
+        ({"make_env": normalized_states}, r"observation='test_study.make_env', and observation='state'"),
+    ],
+)
+@pytest.mark.parametrize("remembers", [True, False])
+def test_a_folder_is_of_one_setting(tmp_path, changes, said, remembers):
+    runs = small("longer", pretrain=(56,))
+    study = folder(tmp_path)
+    assert study.missing(runs) == runs and not list(tmp_path.iterdir())
+    remember(tmp_path, study.settings)
+    if not remembers:
+        # From before folders knew their settings: their rows say some.
+        (tmp_path / "study.json").unlink()
+        append_rows(study.rows, [Row("lbs", "walker", "run", 9, 56, 48, True, False, "none", "tiny", 1.0, 0.0, 1)])
+        said = said.replace("test_study.make_env", "pixels")
+    assert folder(tmp_path).missing(runs) == runs
+    elsewhere = replace(study, arguments={**study.arguments, "device": "cuda"})
+    assert elsewhere.missing(runs) == runs
+    if not remembers and "batch_size" in said:
+        return
+    for act in ("missing", "work"):
+        with pytest.raises(ValueError, match=f"{said}.*or another --folder"):
+            getattr(replace(study, **changes), act)(runs)
+
+
+def test_a_damaged_memory_is_named(tmp_path):
+    (tmp_path / "study.json").write_text("{")
+    with pytest.raises(ValueError, match=r"study.json is damaged"):
+        folder(tmp_path).missing(small("longer"))
+
+
+def test_who_finds_nothing_to_do_says_why(tmp_path, capsys):
+    study, runs = folder(tmp_path), small("longer", pretrain=(56,))
+    with study._locked(runs[0].start.name):
+        assert folder(tmp_path).work(runs) == 0
+    assert f"at it: the pre-training {runs[0].start.name}." in capsys.readouterr().out
+    append_rows(study.rows, [Row("lbs", "walker", "run", 0, 56, 48, True, False, "none", "tiny", 1.0, 0.0, 1,
+                                 further={"run_folder": runs[0].name})])  # fmt: skip
+    assert study.work(runs) == 0 and "Nothing is missing." in capsys.readouterr().out
+
+
+def test_an_interrupted_study_says_how_it_goes_on(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(StudyFolder, "work", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    options = ["--folder", str(tmp_path), "--methods", "lbs", "--tasks", "walker-run", "--seeds", "1"]
+    assert main(["study", "modules", "run", *options]) == 130
+    assert capsys.readouterr().err == "sb3-dreamer-urlb: interrupted; the same command goes on where it was.\n"
 
 
 def test_the_command_lists(tmp_path, capsys):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from stable_baselines3.common.logger import configure
 
 from sb3_dreamer_urlb import EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.cli.compare import compare_runs
+from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.run_facts import read_run, thinned
 from sb3_dreamer_urlb.evaluation.run_page import _summary
@@ -175,6 +179,84 @@ def test_bad_input(command: list[str], message: str, tmp_path: Path, capsys: Any
     monkeypatch.chdir(tmp_path)
     assert main(command) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_folder_of_runs_is_no_run(run: Path, tmp_path: Path, capsys: Any) -> None:
+    for name in ("one", "two"):
+        shutil.copytree(run, tmp_path / name)
+    assert main(["report", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "holds several runs" in said and "one" in said and "two" in said
+    # A run's own log counts, whatever lies below it; so do the folders that a logger numbers.
+    shutil.copy(run / "progress.csv", tmp_path)
+    assert len(read_run(tmp_path).series["train/kl"]) == len(read_run(run).series["train/kl"])
+    both = tmp_path / "both"
+    for number in (1, 2):
+        (both / f"DreamerV2_{number}").mkdir(parents=True)
+        shutil.copy(run / "progress.csv", both / f"DreamerV2_{number}")
+    assert len(read_run(both).series["train/kl"]) == 2 * len(read_run(run).series["train/kl"])
+
+
+def test_a_run_without_a_readable_snapshot(run: Path, tmp_path: Path) -> None:
+    """How many frames a step has is read from the log, or said to be unknown; the damage is named once."""
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (copy / "snapshot.zip").write_bytes(b"broken")
+    facts = read_run(copy)
+    assert facts.action_repeat == 2 and sum("snapshot.zip" in note for note in facts.notes) == 1
+    with open(copy / "progress.csv", newline="") as file:
+        lines = [{name: text for name, text in line.items() if name != "time/phase_frames"} for line in csv.DictReader(file)]
+    with open(copy / "progress.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, lines[0])
+        writer.writeheader()
+        writer.writerows(lines)
+    assert read_run(copy).action_repeat is None
+    assert main(["report", str(copy)]) == 0
+    text = Page((copy / "report.html").read_text()).text
+    assert "agent steps" in text and "environment frames" not in text.replace("no environment", "") and "unknown" in text
+    with pytest.raises(ValueError, match="cannot stand over the same frames"):
+        compare_runs({"a": [run], "b": [copy]}, tmp_path / "page.html")
+
+
+def test_rows_of_other_runs_are_not_shown_as_this_one_s(run: Path, tmp_path: Path) -> None:
+    [row] = [row for row in read_run(run).rows if row.finetune_frames][:1]
+    others = [
+        replace(row, seed=row.seed + 1), replace(row, method="icm"), replace(row, domain="jaco"), replace(row, preset="paper"),
+        replace(row, pretrain_frames=1), replace(row, finetune_frames=10**6), replace(row, keep_actor=not row.keep_actor),
+    ]  # fmt: skip
+    append_rows(tmp_path / "rows.csv", others)
+    facts = read_run(run, [tmp_path / "rows.csv"])
+    assert [one.key for one in facts.rows] == [one.key for one in read_run(run).rows] and facts.rows
+    assert any("7 rows are about other runs" in note for note in facts.notes)
+    # Without a snapshot nobody knows: the page shows whose they are.
+    (tmp_path / "progress.csv").write_bytes((run / "progress.csv").read_bytes())
+    assert main(["report", str(tmp_path)]) == 0
+    text = Page((tmp_path / "report.html").read_text()).text
+    assert "Method, seed" in text and "other runs' maybe among them" in text and "icm, 0" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("monitor.csv", bytes(range(256)), "monitor.csv is damaged: it is no log"),
+        ("0.monitor.csv", b'#{"t_start": 0}\nr,l,t\n1,2,3\n1,x,3\n', "0.monitor.csv is damaged: 1 line"),
+        ("progress.csv", b'a,b\n1,x\n"2\n', "progress.csv is damaged: 2 lines"),
+        ("progress.csv", b"", "progress.csv is damaged: it is empty"),
+        ("progress.csv", b"time/total_timesteps,b\n1,\0\n2,3,4\n", "progress.csv is damaged: 1 line"),
+        ("snapshot.vec_normalize.json", b"{", "snapshot.vec_normalize.json is damaged"),
+        ("snapshot.vec_normalize.json", b"[]", "snapshot.vec_normalize.json is damaged"),
+    ],
+)
+def test_damaged_files_are_named(run: Path, tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (copy / name).write_bytes(content)
+    assert any(said in note for note in read_run(copy).warnings())
+    assert read_run(run).warnings() == []
+
+
+def test_labels_are_no_formulas(run: Path, tmp_path: Path) -> None:
+    assert main(["compare", f"ü$_$={run}", "--out", str(tmp_path / "page.html")]) == 0
 
 
 def test_runs_that_share_no_log(run: Path, tmp_path: Path, capsys: Any) -> None:

@@ -1,0 +1,76 @@
+"""What a user gets wrong costs a line, whatever raises it; what is nobody's mistake keeps its traceback."""
+
+from __future__ import annotations
+
+import gymnasium
+import pytest
+
+from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
+
+
+def raising(error):
+    def command():
+        raise error
+
+    return command
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("a\nb"),
+        ImportError("a b"),
+        FileNotFoundError("a b"),
+        IsADirectoryError("a b"),
+        PermissionError("a b"),
+        FileExistsError("a b"),
+        OSError("a b"),
+        gymnasium.error.NameNotFound("a b"),
+        gymnasium.error.Error("a b"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_mistake_costs_a_line(error, capsys):
+    assert ending_in_a_line("program", raising(error)) == 2
+    assert capsys.readouterr().err == "program: a b\n"
+
+
+@pytest.mark.parametrize(
+    "error", [TypeError("a"), KeyError("a"), BrokenPipeError("a"), ConnectionResetError("a"), SystemExit(3)]
+)
+def test_all_else_keeps_its_traceback(error):
+    with pytest.raises(type(error)):
+        ending_in_a_line("program", raising(error))
+
+
+@pytest.mark.parametrize(("args", "line"), [((), "interrupted."), (("it goes on",), "it goes on")])
+def test_an_interruption_costs_a_line(args, line, capsys):
+    assert ending_in_a_line("program", raising(KeyboardInterrupt(*args))) == 130
+    assert capsys.readouterr().err == f"program: {line}\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("figures {folder} --out {folder}/out", "Is a directory"),
+        ("report {file}", "is no folder of a run"),
+        ("compare A= --out {folder}/page.html", "'A=': expected the folder of a run"),
+        ("compare {folder}, --out {folder}/page.html", "expected the folder of a run"),
+        ("compare {folder} --out {folder}/page.png", "is the page"),
+        ("compare A={folder},{folder}/. --out {folder}/page.html", "more than once"),
+        ("study modules list --folder {file} --methods lbs", "is a file"),
+        ("study modules list --folder {folder} --methods lbs --preset nope", "Unknown preset 'nope'"),
+        ("study modules list --folder {folder} --methods lbs --device foo", "--device foo"),
+        ("study modules run --folder {folder} --methods lbs --minutes nan", "--minutes must be more than 0"),
+        ("study modules run --folder {folder} --methods lbs --at-most -1", "--at-most must be an integer of at least 1"),
+        ("study modules run --folder {folder} --methods lbs random", "keeps pre-trained actors: random trains none"),
+        ("study sparsity list --folder {folder} --methods random", "keeps pre-trained actors: random trains none"),
+    ],
+)
+def test_commands_in_a_line(command, said, tmp_path, capsys):
+    (tmp_path / "file").write_text("x")
+    assert main(command.format(folder=tmp_path, file=tmp_path / "file").split()) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
