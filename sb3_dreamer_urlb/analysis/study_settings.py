@@ -13,6 +13,7 @@ from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 FILE = "study.json"
 #: value of ``observation`` where agents see pictures; rows leave it out
 PIXELS = "pixels"
+SEEN = (PIXELS, "state")
 
 
 def check_same(folder: Path, settings: dict[str, Any]) -> None:
@@ -23,7 +24,8 @@ def check_same(folder: Path, settings: dict[str, Any]) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is a file: a study needs a folder.")
-    known, own = _known(folder), _plain(settings)
+    own = _plain(settings)
+    known = _known(folder, own)
     for name in sorted({*known, *own} if (folder / FILE).exists() else known.keys() & own.keys()):
         if known.get(name) != own.get(name):
             raise ValueError(
@@ -43,7 +45,7 @@ def remember(folder: Path, settings: dict[str, Any]) -> None:
             file.write((json.dumps(_plain(settings), indent=1, sort_keys=True) + "\n").encode())
 
 
-def _known(folder: Path) -> dict[str, Any]:
+def _known(folder: Path, own: dict[str, Any]) -> dict[str, Any]:
     path, rows = folder / FILE, folder / "rows.csv"
     if path.exists():
         try:
@@ -57,7 +59,9 @@ def _known(folder: Path) -> dict[str, Any]:
     first = next(iter(read_rows(rows, strict=False).rows), None) if rows.exists() else None
     if first is None:
         return {}
-    return {"preset": first.preset, "episodes": first.episodes, "observation": first["observation"] or PIXELS}
+    said: dict[str, Any] = {"preset": first.preset, "episodes": first.episodes}
+    # Of environments of somebody's own a row says nothing.
+    return {**said, "observation": first["observation"] or PIXELS} if own["observation"] in SEEN else said
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def bars(
     from matplotlib.patches import Patch
 
     wide = 0.84 / max(1, len(series))
-    handles = []
+    handles, notes = [], []
     for i, (label, estimates) in enumerate(series.items()):
         color, hatch = COLORS[i % len(COLORS)], HATCHES[(i + i // len(COLORS)) % len(HATCHES)]
         handles.append(Patch(facecolor=color, hatch=hatch, edgecolor="white", label=label))
@@ -164,14 +164,33 @@ def bars(
                 around = [[scale * (estimate.value - estimate.low)], [scale * (estimate.high - estimate.value)]]
                 axes.errorbar(x, scale * estimate.value, around, color="#333333", lw=0.9, capsize=1.5)
             if part:
-                # At its foot, away from the error bar.
-                axes.text(x, 0.02, f"{estimate.tasks} of {tasks} tasks", transform=axes.get_xaxis_transform(), rotation=90,
-                          ha="center", va="bottom", fontsize=6, color="black")  # fmt: skip
+                ends = (0.0, estimate.value, estimate.high)
+                notes.append(
+                    (x, scale * max(end for end in ends if not math.isnan(end)), f"{estimate.tasks} of {tasks} tasks")
+                )
     axes.set_xticks(range(len(groups)), groups)
     axes.set_xlim(-0.5, len(groups) - 0.5)
     axes.set_ylim(bottom=min(0, axes.get_ylim()[0]))
+    _write_above(axes, notes)
     axes.tick_params(axis="x", length=0)
     return handles
+
+
+def _write_above(axes: Any, notes: Sequence[tuple[float, float, str]], size: float = 6) -> None:
+    """Words on end above bars and their error bars, with room for them.
+
+    :param axes: to write in
+    :param notes: where on the x axis, above what height, the words
+    :param size: of the letters, points
+    """
+    tall = axes.get_position().height * axes.figure.get_size_inches()[1]
+    for x, height, text in notes:
+        axes.annotate(text, (x, height), xytext=(0, 3), textcoords="offset points", rotation=90, ha="center", va="bottom",
+                      fontsize=size)  # fmt: skip
+        # A letter is about half as wide as it is high.
+        share = min(0.8, (0.55 * size * len(text) + 6) / 72 / tall)
+        low, high = axes.get_ylim()
+        axes.set_ylim(top=max(high, (height - low * share) / (1 - share)))
 
 
 def lines(

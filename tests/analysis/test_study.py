@@ -137,7 +137,7 @@ def test_a_study_from_normalised_states(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"arguments": {"preset": "small"}}, "preset='tiny', and preset='small' is asked for"),
+        ({"arguments": {"preset": "small", "learning_starts": 12}}, "preset='tiny', and preset='small' is asked for"),
         ({"arguments": {"preset": "tiny", "learning_starts": 12, "batch_size": 4}}, "batch_size=None"),
         ({"episodes": 3}, "episodes=1, and episodes=3"),
         ({"make_env": normalized_states}, r"observation='test_study.make_env', and observation='state'"),

@@ -98,6 +98,16 @@ def test_missing_runs_are_labelled_gaps() -> None:
     assert sorted(round(bar.get_height(), 6) for bar in axes.patches) == [20, 30, 50]
 
 
+@pytest.mark.parametrize("high", [0.05, 0.5, 1.0])
+def test_words_stand_above_the_error_bar_and_below_the_edge(high: float) -> None:
+    figure, [axes] = new_figure(1)
+    bars(axes, ["x"], {"a": [Estimate(high / 2, 0, high, 3, (3, 3))], "b": [Estimate(0.7, 0.6, 0.8, 4, (3, 3))]}, [4])
+    figure.canvas.draw()
+    [words] = [text for text in axes.texts if "of" in text.get_text()]
+    box, edge = words.get_window_extent(), axes.get_window_extent()
+    assert box.y0 > axes.transData.transform((0, 100 * high))[1] and box.y1 <= edge.y1 + 1
+
+
 def test_lines_are_broken_where_a_snapshot_is_missing(rows: list[Row]) -> None:
     some = [row for row in rows if (row.method, row.pretrain_frames) != ("lbs", 500_000)]
     picture = paper_figures.snapshots_by_method(Study(some))
