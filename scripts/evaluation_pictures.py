@@ -55,9 +55,10 @@ def draw_comparison(out: Path) -> None:
                 path.mkdir(parents=True)
                 with open(path / "progress.csv", "w", newline="") as file:
                     writer = csv.writer(file)
-                    writer.writerow(["time/total_timesteps", "rollout/ep_rew_mean"])
+                    writer.writerow(["time/total_timesteps", "time/phase_frames", "rollout/ep_rew_mean"])
                     # Two frames make a step.
-                    writer.writerows((2 * int(row["step"]), row["return"]) for row in rows if row["run"] == run)
+                    own = ((int(row["step"]), row["return"]) for row in rows if row["run"] == run)
+                    writer.writerows((step, 2 * step, value) for step, value in own)
                 groups.setdefault(label, []).append(str(path))
         page = Path(folder) / "comparison.html"
         main(["compare", *(f"{label}={','.join(paths)}" for label, paths in groups.items()), "--out", str(page)])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sb3_dreamer_urlb.callbacks.snapshot import SNAPSHOT_FRAMES
 from sb3_dreamer_urlb.envs.registration import PRIMAL_TASK, URLB_TASKS, env_id
+from sb3_dreamer_urlb.intrinsic import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.registry import get_intrinsic_reward
 from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
@@ -212,7 +213,9 @@ def runs_of(name: str, plan: Plan, scratch: bool = False) -> list[FineTuning]:
     others: Sequence[str] = [task for task in plan.tasks if task not in _JACO] if name == "sparsity" else ()
     if others:
         raise ValueError(f"The study {name} is about Jaco: it has no {', '.join(others)}.")
-    untrained = [one for one in plan.methods if name in ABOUT_ACTORS and not get_intrinsic_reward(one).trains_actor]
+    untrained = [
+        one for one in plan.methods if name in ABOUT_ACTORS and not get_intrinsic_reward(one, IntrinsicReward).trains_actor
+    ]
     if untrained:
         raise ValueError(
             f"The study {name} keeps pre-trained actors: {', '.join(untrained)} trains none. Leave it out of --methods."

@@ -100,7 +100,7 @@ def _columns(texts: Any) -> dict[str, Any]:
     if "method" in columns:
         columns["method"] = method_name(str(columns["method"]))
     blank = Row("lbs", "walker", "run", 0, 0, 0, None, None, "none", "paper", 0.0, 0.0, 1)
-    required = {name: value for name, value in columns.items() if name in REQUIRED}
+    required: dict[str, Any] = {name: value for name, value in columns.items() if name in REQUIRED}
     further = {name: value for name, value in columns.items() if name not in REQUIRED}
     try:
         parse(written(replace(blank, **required, further=further)), strict=False)
