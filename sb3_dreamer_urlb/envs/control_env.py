@@ -24,6 +24,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from sb3_dreamer_urlb.envs.domain_rewards import KEY, DomainRewards
 from sb3_dreamer_urlb.envs.options import PixelOptions
 from sb3_dreamer_urlb.envs.rendering import claim_renderer, load_physics
+from sb3_dreamer_urlb.number_checks import is_integer
 
 load_physics()
 
@@ -113,12 +114,15 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         """
 
     def perturb(self, perturbed: PerturbedControl) -> None:
-        """Step through this one from now on.
+        """Step through this one from the next reset on; an episode that is running is over.
 
         :param perturbed: stands around the same bare environment
+        :raises gymnasium.error.ClosedEnvironmentError: after ``close()``
         """
+        self._refuse_closed()
         self.perturbed = perturbed
         self._shimmy = ShimmyEnv(perturbed)
+        self._episode_over = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.
@@ -126,10 +130,14 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         :param seed: 0 to 2**32 - 1, or None to go on with the stream
         :param options: ignored
         :return: the first observation and an empty info
+        :raises ValueError: for any other seed
+        :raises gymnasium.error.ClosedEnvironmentError: after ``close()``
         :raises dm_control.rl.control.PhysicsError: if the simulation diverges
         """
-        if self._closed:
-            raise ClosedEnvironmentError(f"{self} was closed: make a new one.")
+        self._refuse_closed()
+        if seed is not None and not (is_integer(seed) and 0 <= seed < 2**32):
+            raise ValueError(f"{self}: seed={seed!r}: expected None or an int from 0 to {2**32 - 1}")
+        seed = None if seed is None else int(seed)
         super().reset(seed=seed)
         if seed is not None and self.perturbed is not None:
             self.perturbed.seed(seed)
@@ -146,8 +154,10 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         :return: observation, reward, terminated, truncated, info
         :raises ValueError: if the action has another shape, or holds NaN or infinity
         :raises gymnasium.error.ResetNeeded: before the first ``reset()``, and after the end of an episode
+        :raises gymnasium.error.ClosedEnvironmentError: after ``close()``
         :raises dm_control.rl.control.PhysicsError: if the simulation diverges; the episode is then over
         """
+        self._refuse_closed()
         if self._episode_over:
             raise ResetNeeded(f"{self}: call reset() before step(): no episode is running.")
         control_action = self._to_control(action)
@@ -175,11 +185,14 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         """The present state, drawn for people: of ``render_size``, whatever the size of the observations.
 
         :return: uint8 (render_size, render_size, 3), or None without a render mode
+        :raises gymnasium.error.ResetNeeded: before the first ``reset()``
+        :raises gymnasium.error.ClosedEnvironmentError: after ``close()``
         """
+        self._refuse_closed()
         if self.render_mode is None:
             gymnasium.logger.warn(f"{self} was made without a render mode: nothing to render. Use 'rgb_array'.")
             return None
-        if not self._was_reset or self._closed:
+        if not self._was_reset:
             raise ResetNeeded(f"{self}: call reset() before render().")
         return self._picture(self._options.render_size)
 
@@ -188,6 +201,19 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         if not self._closed:
             self._closed = self._episode_over = True
             self._shimmy.close()
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise ClosedEnvironmentError(f"{self} was closed: make a new one.")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and for pickle.
+
+        :raises TypeError: for tasks of composer (Jaco, manipulation), whose models dm_control cannot copy
+        """
+        if isinstance(self._control, composer.Environment):
+            raise TypeError(f"{self} can be neither pickled nor copied: dm_control cannot copy its model. Make it again.")
+        return self.__dict__
 
     def __str__(self) -> str:
         registered = f" ({self.spec.id})" if self.spec else ""

@@ -12,17 +12,49 @@ import numpy as np
 
 from sb3_dreamer_urlb.envs import perturbations as rwrl
 from sb3_dreamer_urlb.envs.domain_rewards import DomainRewards, check_domain
-from sb3_dreamer_urlb.envs.options import PixelOptions, check_choice, refuse_unknown
+from sb3_dreamer_urlb.envs.options import PixelOptions, check_choice, refuse_unknown, refuse_where_nothing_is_drawn
 from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
-from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task
+from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task, meant_by
 from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
-from sb3_dreamer_urlb.envs.task_names import check_task
+from sb3_dreamer_urlb.envs.task_names import check_task, names
 
 if TYPE_CHECKING:
     from dm_control import composer
     from dm_control.rl import control
 
     from sb3_dreamer_urlb.envs.control_env import ControlEnv
+
+
+def make_named_env(named: str, **options: Any) -> gymnasium.Env[Any, Any]:
+    """What ``gymnasium.make`` calls for the ids that name a task.
+
+    :param named: the id
+    :param options: what the id says, and those of :func:`make_urlb_env` or, for perturbed ids, :func:`make_rwrl_env`
+    :return: as those
+    :raises ValueError: for options that contradict the id, and for wrong ones
+    """
+    meant = meant_by(named)
+    is_perturbed = "level" in meant
+    known = {"domain": rwrl.LIMBS, "task": ("walk",), "level": rwrl.LEVELS} if is_perturbed else names()
+    for option, value in meant.items():
+        given = options.setdefault(option, value)
+        # What is no name at all is answered by the function that makes it, with the known ones.
+        if isinstance(given, str) and given in known[option] and given != value:
+            raise ValueError(
+                f"{option}={given!r} contradicts the id {named}, whose {option} is {value!r}: leave it out, "
+                f"or make {_id_for(named, {**meant, option: given})}"
+            )
+    return (make_rwrl_env if is_perturbed else make_dmc_env)(**options)
+
+
+def _id_for(named: str, wanted: dict[str, str]) -> str:
+    """For whoever wants something else than an id says.
+
+    :param named: the id
+    :param wanted: domain, task, and level if it is perturbed
+    """
+    same_kind = [name for name in gymnasium.registry if name.split("/")[0] == named.split("/")[0]]
+    return next((name for name in same_kind if meant_by(name) == wanted), "urlb/dm_control-v0, which takes domain and task")
 
 
 def make_urlb_env(
@@ -130,7 +162,7 @@ def make_dmc_env(
     options = PixelOptions(
         image_size=image_size,
         action_repeat=action_repeat,
-        camera=_default_camera(domain) if camera is None else camera,
+        camera=_camera(camera, domain, observation, render_mode),
         reward_free=reward_free,
         fast_render=fast_render,
         render_mode=render_mode,
@@ -173,12 +205,21 @@ def make_rwrl_env(
     """
     check_choice("task", task, ("walk",), "the Real-World RL suite's levels are of the task")
     perturbed_by = rwrl.level(domain, level, hard_thigh=hard_thigh, keep_buffers=keep_buffers)
+    if options.get("perturbations") is not None:
+        raise ValueError(
+            f"perturbations={options['perturbations']!r}: the Real-World RL suite's {domain}-{task} is perturbed already, "
+            f"by its level {level}; perturb urlb/{domain}-{task}-v0 instead"
+        )
+    options.pop("perturbations", None)
     known = {field.name for field in dataclasses.fields(PixelOptions)}
     refuse_unknown(
         {name: value for name, value in options.items() if name not in known},
         *("domain", "task", "level", "hard_thigh", "keep_buffers"),
     )
-    shown = PixelOptions(camera=_default_camera(domain) if camera is None else camera, **options)
+    shown = PixelOptions(
+        camera=_camera(camera, domain, options.get("observation"), options.get("render_mode")),
+        **options,
+    )
     return _show(shown, perturbed_by, domain, task, functools.partial(_make_rwrl_control, domain))
 
 
@@ -216,9 +257,15 @@ def _show(
     return gymnasium.wrappers.HumanRendering(env) if in_window else env
 
 
-def _default_camera(domain: str) -> int:
-    """The benchmark's: ``y`` of the quadruped, else the model's first."""
-    return 2 if domain == "quadruped" else 0
+def _camera(camera: int | str | None, domain: str, observation: Any, render_mode: Any) -> int | str:
+    """The camera that was asked for, or the benchmark's: ``y`` of the quadruped, else the model's first.
+
+    :raises ValueError: if one was asked for where nothing is drawn
+    """
+    if camera is None:
+        return 2 if domain == "quadruped" else 0
+    refuse_where_nothing_is_drawn("camera", camera, observation, render_mode)
+    return camera
 
 
 def _make_rwrl_control(domain: str) -> control.Environment:

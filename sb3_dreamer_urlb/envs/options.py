@@ -72,8 +72,21 @@ class PixelOptions:
             raise ValueError(
                 f"image_size={self.image_size!r}: observation='state' holds no image; leave it out, or ask for 'both'"
             )
-        if self.observation == "state" and self.render_mode is None and self.fast_render:
-            raise ValueError("fast_render=True: observation='state' without a render_mode draws nothing; leave it out")
+        for name in ("fast_render", "render_size"):
+            if getattr(self, name) != getattr(PixelOptions, name):
+                refuse_where_nothing_is_drawn(name, getattr(self, name), self.observation, self.render_mode)
+
+
+def refuse_where_nothing_is_drawn(name: str, value: Any, observation: Any, render_mode: Any) -> None:
+    """
+    :param name: of an option about pictures
+    :param value: what was given
+    :param observation: option of that name
+    :param render_mode: option of that name
+    :raises ValueError: if there are no pictures
+    """
+    if isinstance(observation, str) and observation == "state" and render_mode is None:
+        raise ValueError(f"{name}={value!r}: observation='state' without a render_mode draws nothing; leave it out")
 
 
 def refuse_unknown(unknown: dict[str, Any], *others: str) -> None:

@@ -45,7 +45,7 @@ class Perturbations:
     :param action_delay: control steps between an action and its execution
     :param reward_delay: control steps between a reward and its return
     :param action_repetition: control steps that each (delayed, noisy) action is held for; None and 1 hold none
-    :param repetition_probability: of an action to be held
+    :param repetition_probability: of an action to be held; only with ``action_repetition``
     :param action_noise: standard deviation of a normal added to each action, in the task's own units; the result is clipped to
         the task's bounds
     :param thigh_length: half the length of the walker's thighs in metres (0.225 unperturbed): a number, or a range from which
@@ -75,6 +75,11 @@ class Perturbations:
         self._check("action_repetition", held is None or (is_integer(held) and held >= 1), "None or an int of at least 1")
         probability = self.repetition_probability
         self._check("repetition_probability", is_finite_number(probability) and 0 <= probability <= 1, "a number from 0 to 1")
+        self._check(
+            "repetition_probability",
+            held is not None or probability == 1,
+            "action_repetition with it: alone it has no effect",
+        )
         self._check(
             "action_noise", is_finite_number(self.action_noise) and self.action_noise >= 0, "a finite number of at least 0"
         )

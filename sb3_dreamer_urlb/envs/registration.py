@@ -23,6 +23,9 @@ JACO_VARIANTS = ("fixed", "sparse", "dense")
 #: The Jaco tasks' variants by name, of the paper's extended analysis.
 JACO_VARIANT_TASKS = tuple(f"{task}-{variant}" for task in URLB_TASKS["jaco"] for variant in JACO_VARIANTS)
 
+#: Name of the argument that tells an environment under which id it is made.
+NAMED = "named"
+
 DOMAINS: tuple[str, ...] = tuple(URLB_TASKS)
 
 #: The task whose environment an agent is pre-trained in, one a domain; its reward is not used.
@@ -72,21 +75,35 @@ def register_envs() -> None:
     """
     for domain, tasks in URLB_TASKS.items():
         for task in tasks:
-            _register(env_id(domain, task), "make_urlb_env", {"domain": domain, "task": task})
-    _register("urlb/dm_control-v0", "make_dmc_env", {})
+            _register(env_id(domain, task))
+    _register("urlb/dm_control-v0")
     for task in JACO_VARIANT_TASKS:
-        _register(variant_id(task), "make_dmc_env", {"domain": "jaco", "task": task})
+        _register(variant_id(task))
     for domain in RWRL_DOMAINS:
-        for level, name in rwrl_ids(domain).items():
-            _register(name, "make_rwrl_env", {"domain": domain, "task": "walk", "level": level})
+        for name in rwrl_ids(domain).values():
+            _register(name)
 
 
-def _register(name: str, function: str, kwargs: dict[str, str]) -> None:
-    """Register one id, unless it is.
+def meant_by(name: str) -> dict[str, str]:
+    """What an id of this package says: ``domain`` and ``task``, and ``level`` if it is perturbed. Empty for any other id.
 
     :param name: the id
-    :param function: of the module ``dmc``
-    :param kwargs: its arguments
     """
+    for domain, tasks in URLB_TASKS.items():
+        for level, perturbed in rwrl_ids(domain).items():
+            if name == perturbed:
+                return {"domain": domain, "task": "walk", "level": level}
+        for task in (*tasks, *(JACO_VARIANT_TASKS if domain == "jaco" else ())):
+            if name == f"urlb/{domain}-{task}-v0":
+                return {"domain": domain, "task": task}
+    return {}
+
+
+def _register(name: str) -> None:
+    """Register one id, unless it is."""
     if name not in gymnasium.registry:
+        meant = meant_by(name)
+        # Who is made is not told its id: so that options which contradict it are noticed, it is an argument.
+        kwargs = {**meant, NAMED: name} if meant else {}
+        function = "make_named_env" if meant else "make_dmc_env"
         gymnasium.register(name, entry_point=f"sb3_dreamer_urlb.envs.dmc:{function}", kwargs=kwargs)

@@ -66,6 +66,12 @@ def known_tasks() -> dict[str, tuple[str, ...]]:
     return {**DM_CONTROL_TASKS, **known}
 
 
+def names() -> dict[str, set[str]]:
+    """All names of domains, and those of tasks, whatever domain they are of."""
+    known = known_tasks()
+    return {"domain": set(known), "task": {task for tasks in known.values() for task in tasks}}
+
+
 def check_task(domain: str, task: str) -> None:
     """
     :param domain: of the suite, ``"manipulation"``, or one of the benchmark's

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_dreamer_urlb.envs.rendering import load_physics
+from sb3_dreamer_urlb.envs.suite_tasks import load_suite_task
 
 load_physics()
 
@@ -131,4 +132,4 @@ def make_suite_task(domain: str, task: str) -> control.Environment:
             time_limit=_QUADRUPED_TIME_LIMIT,
             control_timestep=_QUADRUPED_CONTROL_STEP,
         )
-    return suite.load(domain, task)
+    return load_suite_task(domain, task)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import pickle
+import re
 import warnings
 
 import gymnasium
@@ -319,8 +322,34 @@ def test_the_order_of_calls():
     env.close()
     with pytest.raises(ClosedEnvironmentError, match="walker-walk"):
         env.reset()
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros(6, np.float32))
+    for call in (lambda: env.step(np.zeros(6, np.float32)), env.render):
+        with pytest.raises(ClosedEnvironmentError, match=r"walker-walk.* was closed"):
+            call()
+
+
+@pytest.mark.parametrize("name", ["urlb/walker-run-v0", "rwrl/walker-walk-easy-v0", "urlb/jaco-reach_top_left-v0"])
+def test_seeds_that_are_none_are_named(name):
+    env = gymnasium.make(name, observation="state")
+    for seed in (-1, 2**32, 2**70, 1.5, True, "a", [1]):
+        with pytest.raises(
+            ValueError, match=rf"{re.escape(name)}.*seed={re.escape(repr(seed))}: expected None or an int from 0"
+        ):
+            env.reset(seed=seed)
+    np.testing.assert_array_equal(env.reset(seed=np.int64(3))[0], env.reset(seed=3)[0])
+    env.reset(seed=2**32 - 1)
+
+
+def test_what_composer_compiles_cannot_be_copied_and_says_so():
+    """Of the suite, copies go on where the original is."""
+    arm = gymnasium.make("urlb/jaco-reach_top_left-v0", observation="state")
+    for again in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match=r"jaco-reach_top_left.* can be neither pickled nor copied"):
+            again(arm)
+    walker = gymnasium.make("urlb/walker-run-v0", observation="state")
+    walker.reset(seed=0)
+    other = pickle.loads(pickle.dumps(walker))
+    action = np.full(6, 0.3, np.float32)
+    assert walker.step(action)[1] == other.step(action)[1]
 
 
 @pytest.mark.parametrize("domain", DOMAINS)

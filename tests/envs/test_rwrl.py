@@ -11,6 +11,7 @@ from fractions import Fraction
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from without_display import run
@@ -176,6 +177,48 @@ def test_one_wrapper_for_any_subset_on_any_task():
         PerturbationWrapper(built, Perturbations(), action_delay=1)
 
 
+def test_an_episode_that_is_running_is_over_when_it_is_perturbed():
+    env = gymnasium.make("urlb/walker-run-v0", observation="state")
+    env.reset(seed=0)
+    action = np.zeros(6, np.float32)
+    env.step(action)
+    wrapped = PerturbationWrapper(env, reward_delay=3, thigh_length=0.5)
+    for one in (wrapped, env):
+        with pytest.raises(ResetNeeded, match="walker-run"):
+            one.step(action)
+    fresh = make_states("walker", "run", perturbations={"reward_delay": 3, "thigh_length": 0.5})
+    assert rewards(wrapped, 5, seed=1) == rewards(fresh, 5, seed=1)
+
+
+def test_what_is_closed_cannot_be_perturbed():
+    env = gymnasium.make("urlb/walker-run-v0", observation="state")
+    env.close()
+    with pytest.raises(ClosedEnvironmentError, match=r"walker-run.* was closed"):
+        PerturbationWrapper(env, action_delay=1)
+
+
+def test_a_wrapped_environment_is_made_again_from_its_spec():
+    wrapped = PerturbationWrapper(
+        gymnasium.make("urlb/walker-run-v0", observation="state"), reward_delay=3, thigh_length=(0.3, 0.4)
+    )
+    written = gymnasium.envs.registration.EnvSpec.from_json(wrapped.spec.to_json())
+    for spec in (wrapped.spec, written):
+        again = gymnasium.make(spec)
+        assert again.unwrapped.perturbed.perturbations == wrapped.unwrapped.perturbed.perturbations
+        assert rewards(again, 5, seed=1) == rewards(wrapped, 5, seed=1)
+
+
+def test_what_is_perturbed_already_says_so():
+    for make in (
+        functools.partial(gymnasium.make, "rwrl/walker-walk-hard-v0"),
+        functools.partial(make_rwrl_env, "walker", "walk", "hard"),
+    ):
+        with pytest.raises(
+            ValueError, match=r"perturbations=.*walker-walk is perturbed already, by its level hard; .*urlb/walker-walk-v0"
+        ):
+            make(perturbations={"action_delay": 1}, observation="state")
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     name=st.sampled_from(["action_noise", "repetition_probability", "thigh_length", "shin_length"]),
@@ -249,6 +292,7 @@ def test_shins_too_short_to_begin_with_are_named():
         ({"thigh_length": (0.4, 0.2)}, r"thigh_length=\(0.4, 0.2\): expected a range \(least, most\)"),
         ({"thigh_length": (0.1, 0.2, 0.3)}, "thigh_length="),
         ({"thigh_length": 0}, "thigh_length=0"),
+        ({"repetition_probability": 0.5}, "repetition_probability=0.5: expected action_repetition with it"),
         ({"keep_buffers": "yes"}, "keep_buffers='yes': expected True or False"),
         ({"action_dealy": 1}, "unknown perturbation action_dealy: known are action_delay, .*shin_length"),
         ({"shin_length": 0.3}, "shin_length=0.3: only the quadruped has it, not walker"),

@@ -238,6 +238,8 @@ def test_stable_baselines3_makes_them():
         ({"observation": None}, r"observation=None"),
         ({"observation": "state", "image_size": 84}, r"image_size=84: observation='state' holds no image"),
         ({"observation": "state", "fast_render": True}, r"fast_render=True: observation='state' without a render_mode"),
+        ({"observation": "state", "render_size": 100}, r"render_size=100: observation='state' without a render_mode"),
+        ({"observation": "state", "camera": "back"}, r"camera='back': observation='state' without a render_mode"),
         ({"obs": "state"}, r"unknown option obs: known are action_repeat, camera, .*observation, .*render_size"),
     ],
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium
 import pytest
 from without_display import run
 
-from sb3_dreamer_urlb.envs import URLB_TASKS, load_physics, make_control_env
+from sb3_dreamer_urlb.envs import URLB_TASKS, load_physics, make_control_env, registration
 from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS
 from sb3_dreamer_urlb.envs.task_names import DM_CONTROL_TASKS, check_task, known_tasks
 
@@ -83,3 +85,50 @@ print([name for name in ("mujoco", "dm_control", "OpenGL", "glfw", "shimmy") if 
 def test_every_message_names_what_was_given():
     with pytest.raises(ValueError, match="domain='jaco': the Real-World RL suite's levels are of walker, quadruped"):
         gymnasium.make("rwrl/walker-walk-easy-v0", domain="jaco")
+
+
+#: ids that name a task
+NAMED = [name for name in gymnasium.registry if name.startswith(("urlb/", "rwrl/")) and name != "urlb/dm_control-v0"]
+#: what other ids say
+OTHER = {"domain": ("walker", "quadruped"), "task": ("stand", "walk"), "level": ("easy", "hard")}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_options_that_contradict_an_id_are_refused_with_both(name):
+    meant = registration.meant_by(name)
+    for option in meant:
+        for value in OTHER[option]:
+            if value == meant[option] or ("level" in meant and option == "task"):
+                continue
+            with pytest.raises(
+                ValueError, match=f"{option}={re.escape(repr(value))} contradicts the id {name}, whose"
+            ) as caught:
+                gymnasium.make(name, observation="state", **{option: value})
+            assert repr(meant[option]) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_id_that_was_meant_is_told():
+    for name, given, told in [
+        ("rwrl/walker-walk-easy-v0", {"level": "hard"}, "rwrl/walker-walk-hard-v0"),
+        ("rwrl/walker-walk-easy-v0", {"domain": "quadruped"}, "rwrl/quadruped-walk-easy-v0"),
+        ("urlb/walker-run-v0", {"task": "stand"}, "urlb/walker-stand-v0"),
+        ("urlb/walker-run-v0", {"domain": "cheetah"}, "urlb/dm_control-v0, which takes domain and task"),
+        ("urlb/jaco-reach_top_left-sparse-v0", {"task": "reach_top_left-dense"}, "urlb/jaco-reach_top_left-dense-v0"),
+    ]:
+        with pytest.raises(ValueError, match=f"make {told}$"):
+            gymnasium.make(name, **given)
+
+
+def test_options_that_say_what_the_id_says_are_taken():
+    env = gymnasium.make("rwrl/walker-walk-hard-v0", domain="walker", level="hard", observation="state")
+    assert (env.get_wrapper_attr("domain"), env.get_wrapper_attr("task")) == ("walker", "walk")
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.perturbed.perturbations == env.unwrapped.perturbed.perturbations
+
+
+def test_ids_and_what_they_mean():
+    assert registration.meant_by("urlb/walker-run-v0") == {"domain": "walker", "task": "run"}
+    assert registration.meant_by("rwrl/quadruped-walk-hard-v0") == {"domain": "quadruped", "task": "walk", "level": "hard"}
+    assert registration.meant_by("urlb/jaco-reach_top_left-fixed-v0") == {"domain": "jaco", "task": "reach_top_left-fixed"}
+    for other in ("urlb/dm_control-v0", "CartPole-v1", "rwrl/jaco-walk-easy-v0"):
+        assert registration.meant_by(other) == {}
