@@ -72,8 +72,8 @@ class DrawnModel(control.Environment):
         """Begin an episode, of another model if the task has another stream than at the last one."""
         if self.task.random is not self._drawn_from:
             self._drawn_from = self.task.random
-            old = self._physics
+            old: Any = self.physics
             drawn = lqr.get_model_and_assets(old.model.nq, old.model.nu, self._drawn_from)
-            self._physics = type(old).from_xml_string(*drawn)
+            self._physics: Any = type(old).from_xml_string(*drawn)
             old.free()
         return super().reset()
