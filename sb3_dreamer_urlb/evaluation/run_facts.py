@@ -92,6 +92,8 @@ class RunFacts:
     def warnings(self) -> list[str]:
         """What a reader should know before trusting the run."""
         found = list(self.notes)
+        if not self.data:
+            found.append("No snapshot can be read: what the run was, and whether updates were skipped, is unknown.")
         for name, text in (("skipped_updates", "updates were skipped: a loss or gradient was not finite"),
                            ("env_faults", "episodes were ended by the guards of environments")):  # fmt: skip
             if self.counters.get(name, 0):

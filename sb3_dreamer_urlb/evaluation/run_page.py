@@ -43,7 +43,7 @@ def run_page(facts: RunFacts, command: str | None = None) -> str:
     reward = facts.arguments.get("intrinsic_reward")
     return render(
         "run.html.j2",
-        title=f"{facts.folder.resolve().name}: {reward or 'no pre-training'}",
+        title=facts.folder.resolve().name + (f": {reward or 'no pre-training'}" if facts.data else ""),
         facts=facts,
         summary=_summary(facts),
         charts=_charts(facts.series, facts.switch, facts.action_repeat),
@@ -109,6 +109,8 @@ def _evaluation(row: Any) -> dict[str, str]:
 
 
 def _call(facts: RunFacts) -> str:
+    if not facts.data:
+        return "# Unknown: no snapshot says what the run was."
     arguments = ", ".join(f"{name}={value!r}" for name, value in sorted(facts.arguments.items()) if value is not None)
     frames = facts.counters.get("pretrained_frames", 0)
     if facts.begins_with_fine_tuning:

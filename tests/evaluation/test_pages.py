@@ -213,6 +213,7 @@ def test_a_run_without_a_readable_snapshot(run: Path, tmp_path: Path) -> None:
     assert read_run(copy).action_repeat is None
     assert main(["report", str(copy)]) == 0
     text = Page((copy / "report.html").read_text()).text
+    assert "is unknown" in text and "no update was skipped" not in text and "Unknown: no snapshot" in text
     assert "agent steps" in text and "environment frames" not in text.replace("no environment", "") and "unknown" in text
     with pytest.raises(ValueError, match="cannot stand over the same frames"):
         compare_runs({"a": [run], "b": [copy]}, tmp_path / "page.html")
