@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import functools
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 from unittest import mock
@@ -20,18 +22,22 @@ from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 CHECKS = (ValueError, ImportError, OSError, gymnasium.error.Error, yaml.YAMLError)
 #: what Python says of arguments that a function does not have, or lacks
 SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
+#: folders of runs that this process has made
+NEW_FOLDERS: list[Path] = []
 
 
 @contextmanager
 def told_in_a_line(prog: str) -> Iterator[None]:
     """Mistakes in options, configurations and environments end the program with a line, as long as no agent has acted.
 
+    The folder that was made for a run which does not begin goes with it: ``enjoy`` would take it for the newest run.
     Once a run collects or a trained agent plays, whatever is raised is not about arguments, and goes on upwards.
 
     :param prog: name of the command
     :raises SystemExit: 2, in place of such an error
     """
     begun: list[bool] = []
+    NEW_FOLDERS.clear()
     acts = [
         mock.patch.object(PhasedAlgorithm, name, _noted(getattr(PhasedAlgorithm, name), begun))
         for name in ("collect_rollouts", "predict")
@@ -42,6 +48,8 @@ def told_in_a_line(prog: str) -> Iterator[None]:
         except Exception as error:
             if begun or not _is_a_mistake(error):
                 raise
+            for folder in NEW_FOLDERS:
+                shutil.rmtree(folder, ignore_errors=True)
             print(f"{prog}: {' '.join(str(error).split())}", file=sys.stderr)
             raise SystemExit(2) from error
 

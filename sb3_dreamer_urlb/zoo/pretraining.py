@@ -20,6 +20,9 @@ from sb3_dreamer_urlb.zoo.resuming import PRETRAINING_LOGS
 #: values of the key ``pretrain_env``: the primal task's environment, or the one that is fine-tuned in
 PRIMAL, SAME = CHOICES = ("primal", "same")
 
+#: arguments of an environment that perturb it, which nobody is pre-trained in
+PERTURBING = ("perturbations", "level", "hard_thigh", "keep_buffers")
+
 
 def primal_id(name: str) -> str | None:
     """The id of the environment in which an agent for a task is pre-trained; None for tasks that have none.
@@ -40,6 +43,8 @@ def primal_id(name: str) -> str | None:
 def make_envs(make: Callable[[], VecEnv], manager: Any) -> VecEnv:
     """The environments in which a run begins. Where they are not the task's, the switch of phases gets those.
 
+    What perturbs the task is left out of the arguments that pre-training's environments get.
+
     :param make: makes environments of ``manager.env_name``, whose episodes Monitor writes to ``manager.save_path``
     :param manager: of rl_zoo3, with its callbacks
     """
@@ -47,7 +52,8 @@ def make_envs(make: Callable[[], VecEnv], manager: Any) -> VecEnv:
     switches = [one for one in manager.callbacks if isinstance(one, PhaseSwitchCallback) and one.env is None]
     if (
         not switches
-        or primal in (None, manager.env_name.gym_id)
+        or primal is None
+        or (primal == manager.env_name.gym_id and not set(PERTURBING) & set(manager.env_kwargs or {}))
         or manager.optimize_hyperparameters
         or manager.pretrain_env == SAME
     ):
@@ -56,5 +62,8 @@ def make_envs(make: Callable[[], VecEnv], manager: Any) -> VecEnv:
     for switch in switches:
         switch.env, switch.closes_pretraining = make(), True
     there = type(manager.env_name)(primal)
-    with mock.patch.multiple(manager, env_name=there, save_path=str(Path(manager.save_path) / PRETRAINING_LOGS)):
+    kwargs = {name: value for name, value in (manager.env_kwargs or {}).items() if name not in PERTURBING}
+    with mock.patch.multiple(
+        manager, env_name=there, env_kwargs=kwargs, save_path=str(Path(manager.save_path) / PRETRAINING_LOGS)
+    ):
         return make()

@@ -32,7 +32,7 @@ from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
-from sb3_dreamer_urlb.zoo import configs, pretraining, resuming
+from sb3_dreamer_urlb.zoo import configs, env_arguments, mistakes, pretraining, resuming
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
@@ -88,6 +88,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     _check_device(manager.device)
     options = manager.args
     run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
+    given, manager.env_kwargs = manager.env_kwargs, {}  # rl_zoo3 would forget the configuration's
     if run is not None and getattr(options, "conf_file", manager.config) is None:
         hyperparams = {**resuming.saved(run, "config"), **(manager.custom_hyperparams or {})}
         config = dict(sorted(hyperparams.items()))
@@ -100,6 +101,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
             manager.config = configs.resolve(manager.config, manager.algo)
             configs.check(manager.config, manager.env_name.gym_id)
         hyperparams, config = original(manager)
+    env_arguments.merge(manager, given, hyperparams, config)
     if manager.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
         raise ValueError(f"How long? Neither -n nor n_timesteps of {manager.env_name.gym_id} in {manager.config} says so.")
     resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
@@ -138,7 +140,7 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
         raise ValueError(f"learning_rate must be a number or 'lin_' and a number, got {given!r}.")
     for name in WHOLE_NUMBERS & set(hyperparams):
         check_integer(name, hyperparams[name], 1)
-    _use_everywhere(manager, hyperparams.get("env_kwargs"))
+    env_arguments.use_everywhere(manager, hyperparams.get("env_kwargs"))
     try:
         found: tuple[dict[str, Any], ...] = original(manager, hyperparams)
     except (NameError, SyntaxError) as error:
@@ -152,19 +154,6 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
             hint = f"; did you mean {' or '.join(meant)}?" if meant else f": neither of rl_zoo3's nor of {manager.algo}'s."
             raise ValueError(f"Unknown hyperparameter {name!r}{hint}")
     return found
-
-
-def _use_everywhere(manager: Any, env_kwargs: dict[str, Any] | None) -> None:
-    """rl_zoo3 gives a configuration's arguments of the environment to training alone. Evaluation, films and ``push_to_hub``
-    know those of the command line, which lie in the run's ``args.yml``.
-
-    :param manager: whose environments are made next
-    :param env_kwargs: the command line's where there were some, else the configuration's
-    """
-    if env_kwargs and isinstance(env_kwargs, dict):
-        manager.args.env_kwargs = dict(env_kwargs)
-        if manager._eval_env_kwargs_args is None:
-            manager.eval_env_kwargs = dict(env_kwargs)
 
 
 def _default_config(algorithm: str, env_id: str) -> Path:
@@ -240,6 +229,14 @@ def _maybe_normalize(original: Callable[..., Any], manager: Any, env: VecEnv, ev
     return load_vec_normalize(statistics, env, training=not eval_env)
 
 
+def _create_log_folder(original: Callable[..., Any], manager: Any) -> None:
+    """Note which folder is new, for the case that the start is refused."""
+    is_new = not Path(manager.save_path).exists()
+    original(manager)
+    if is_new:
+        mistakes.NEW_FOLDERS.append(Path(manager.save_path))
+
+
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
     """Tell snapshots and films their folder, whose number rl_zoo3 chooses; keep the run, so that ``-i`` can go on with it."""
     original(manager)
@@ -313,4 +310,5 @@ _AROUND: dict[str, Callable[..., Any]] = {
     "create_callbacks": _create_callbacks,
     "_load_pretrained_agent": _load_pretrained_agent,
     "_save_config": _save_config,
+    "create_log_folder": _create_log_folder,
 }

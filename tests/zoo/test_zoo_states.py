@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rl_zoo3.utils
 import yaml
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from zoo_commands import CONFIGS, STAND, TRAIN, model_in, train
 
@@ -125,3 +126,30 @@ def test_a_whole_run_then_a_fine_tuning_from_its_snapshot(zoo, monkeypatch, caps
     with pytest.raises(SystemExit):
         main([*TRAIN, *options, "-params", "env_kwargs:dict(observation='state')", "policy:'MlpPolicy'"])
     assert "normalize: {norm_reward: false}" in capsys.readouterr().err
+
+
+def test_the_command_line_changes_what_it_names_of_a_files_arguments(zoo, monkeypatch, capsys):
+    """The paper's range of thighs, from states as the file says; pre-trained unperturbed all the same."""
+    monkeypatch.setitem(gymnasium.registry, STAND, WALKER_STAND)
+    made = []
+    make = EnvSpec.make
+    monkeypatch.setattr(EnvSpec, "make", lambda spec, **kwargs: made.append((spec.id, kwargs)) or make(spec, **kwargs))
+    run = train(zoo, HARD, 8, "states/small/lbs", "--env-kwargs", "hard_thigh:'paper'", params=PHASES)
+    kwargs = dict(made)
+    assert {name: value for name, value in kwargs[STAND].items() if name != "render_mode"} == {"observation": "state"}
+    assert kwargs[HARD] | {"observation": "state", "hard_thigh": "paper"} == kwargs[HARD]
+    saved = yaml.unsafe_load((run / HARD.replace("/", "-") / "config.yml").read_text())
+    assert dict(saved)["env_kwargs"] == {"observation": "state", "hard_thigh": "paper"}
+    zoo("enjoy", "--algo", "dreamerv2", "--env", HARD, "-f", "logs", "-n", "3", "--no-render")
+
+
+def test_a_start_that_is_refused_leaves_no_run(zoo, monkeypatch, capsys):
+    monkeypatch.setitem(gymnasium.registry, STAND, WALKER_STAND)
+    run = train(zoo, STAND, 8, "states/small/lbs", params=PHASES)
+    for wrong in ("level:'easy'", "task:'run'", "camera:'top'"):
+        with pytest.raises(SystemExit, match=r"^2$"):
+            train(zoo, STAND, 8, "states/small/lbs", "--env-kwargs", wrong, params=PHASES)
+    with pytest.raises(SystemExit, match=r"^2$"):
+        train(zoo, STAND, 8, "states/small/lbs", params=[*PHASES, "batch_size:-1"])
+    assert [path for path in run.parent.iterdir() if path.is_dir()] == [run]
+    zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "logs", "-n", "3", "--no-render")
