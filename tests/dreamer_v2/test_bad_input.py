@@ -251,7 +251,7 @@ def test_a_path_of_the_log(tiny_model, tmp_path):
             "intrinsic_reward must be a name, a subclass or an instance of IntrinsicReward, or None, got 3",
         ),
         ({"intrinsic_reward": dict}, "intrinsic_reward must be a name.*dict"),
-        ({"planner": "cem"}, "Unknown planner 'cem'; known are .*'dyna_mpc', 'mppi'"),
+        ({"planner": "cem"}, "Unknown planner 'cem'; known are .*'dyna_mpc'.*'mppi'"),
         (
             {"planner": "dyna_mpc", "planner_kwargs": {"elites": 3}},
             r"Unknown planner_kwargs \['elites'\]; known are .*'top_k'",

@@ -122,7 +122,7 @@ def test_the_planner_is_switched_for_the_evaluation_only(tiny_model: Any, monkey
         ({"episodes": 0}, "episodes must be an integer of at least 1, got 0"),
         ({"seed": -1}, "seed must be an integer of at least 0"),
         ({"planner": "maybe"}, "planner must be one of .*'maybe'"),
-        ({"planner": "on"}, "the model has none"),
+        ({"planner": "on"}, "planner='on': Still has no planner"),
     ],
 )
 def test_bad_input(kwargs: dict[str, Any], message: str) -> None:

@@ -32,7 +32,7 @@ from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
-from sb3_dreamer_urlb.zoo import pretraining, registration
+from sb3_dreamer_urlb.zoo import configs, pretraining, registration
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
@@ -150,7 +150,8 @@ def test_the_page_names_what_exists():
         # Neither a run that goes on nor a task that is found needs a file.
         found = any(f"--env {task} " in options for task in entries(VECTORS)) or re.search(r"-i \S+_1$", options)
         named = command == "train" and not found
-        files = [ROOT / "zoo_configs" / f"{name}.yml" for name in re.findall(r"-conf (\S+)", options)]
+        [algorithm] = re.findall(r"(?:--algo|-a) (\S+)", options)
+        files = [Path(configs.resolve(name, algorithm)) for name in re.findall(r"-conf (\S+)", options)]
         assert [path.is_file() for path in files] == [True] * named
     [own] = yaml.safe_load(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1]).values()
     assert own["learning_rate"] == 1e-4 and len(rl_zoo3.utils.get_callback_list(own)) == 3
@@ -435,6 +436,7 @@ def test_pre_training_happens_in_the_primal_task(domain, monkeypatch, tmp_path):
                     callbacks=callbacks,
                     pretrain_env=choice,
                     optimize_hyperparameters=False,
+                    env_kwargs={},
                 )
                 begins = pretraining.make_envs(lambda its=manager: (str(its.env_name.gym_id), its.save_path), manager)
                 [fine_tunes_in] = [one.env for one in callbacks if isinstance(one, PhaseSwitchCallback)] or [None]
