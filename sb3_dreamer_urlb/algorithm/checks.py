@@ -83,19 +83,6 @@ def check_settings(model: SavedAlgorithm) -> None:
         check_dict(name, getattr(model, name))
 
 
-def check_length(total_timesteps: Any, log_interval: Any) -> None:
-    """What ``learn`` is told.
-
-    :param total_timesteps: a number
-    :param log_interval: a positive integer, or None for no log
-    :raises ValueError: naming the argument, its value and what was expected
-    """
-    if not is_number(total_timesteps):
-        raise ValueError(f"total_timesteps must be a number of agent steps, got {total_timesteps!r}.")
-    if log_interval is not None:
-        check_integer("log_interval", log_interval, 1)
-
-
 def check_schedule_of_updates(model: SavedAlgorithm) -> None:
     """When updates happen, and how many.
 
