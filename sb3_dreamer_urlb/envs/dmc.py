@@ -14,7 +14,7 @@ from sb3_dreamer_urlb.envs import perturbations as rwrl
 from sb3_dreamer_urlb.envs.domain_rewards import DomainRewards, check_domain
 from sb3_dreamer_urlb.envs.options import PixelOptions, check_choice, refuse_unknown, refuse_where_nothing_is_drawn
 from sb3_dreamer_urlb.envs.perturbations import Perturbations, make_perturbations
-from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task, meant_by
+from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, URLB_TASKS, check_urlb_task, id_meaning, meant_by
 from sb3_dreamer_urlb.envs.rendering import load_physics, load_renderer
 from sb3_dreamer_urlb.envs.task_names import check_task, names
 
@@ -42,19 +42,9 @@ def make_named_env(named: str, **options: Any) -> gymnasium.Env[Any, Any]:
         if isinstance(given, str) and given in known[option] and given != value:
             raise ValueError(
                 f"{option}={given!r} contradicts the id {named}, whose {option} is {value!r}: leave it out, "
-                f"or make {_id_for(named, {**meant, option: given})}"
+                f"or make {id_meaning({**meant, option: given}) or 'urlb/dm_control-v0, which takes domain and task'}"
             )
     return (make_rwrl_env if is_perturbed else make_dmc_env)(**options)
-
-
-def _id_for(named: str, wanted: dict[str, str]) -> str:
-    """For whoever wants something else than an id says.
-
-    :param named: the id
-    :param wanted: domain, task, and level if it is perturbed
-    """
-    same_kind = [name for name in gymnasium.registry if name.split("/")[0] == named.split("/")[0]]
-    return next((name for name in same_kind if meant_by(name) == wanted), "urlb/dm_control-v0, which takes domain and task")
 
 
 def make_urlb_env(

@@ -65,6 +65,34 @@ def rwrl_ids(domain: str) -> dict[str, str]:
     return {level: f"rwrl/{domain}-walk-{level}-v0" for level in LEVELS} if domain in RWRL_DOMAINS else {}
 
 
+#: id → what it says: ``domain`` and ``task``, and ``level`` if it is perturbed
+_MEANT: dict[str, dict[str, str]] = {
+    **{env_id(domain, task): {"domain": domain, "task": task} for domain, tasks in URLB_TASKS.items() for task in tasks},
+    **{variant_id(task): {"domain": "jaco", "task": task} for task in JACO_VARIANT_TASKS},
+    **{
+        name: {"domain": domain, "task": "walk", "level": level}
+        for domain in RWRL_DOMAINS
+        for level, name in rwrl_ids(domain).items()
+    },
+}
+
+
+def meant_by(name: str) -> dict[str, str]:
+    """What an id of this package says: ``domain`` and ``task``, and ``level`` if it is perturbed. Empty for any other id.
+
+    :param name: the id
+    """
+    return dict(_MEANT.get(name, {}))
+
+
+def id_meaning(wanted: dict[str, str]) -> str | None:
+    """The id that says this; None if there is none.
+
+    :param wanted: as :func:`meant_by` gives it
+    """
+    return next((name for name, meant in _MEANT.items() if meant == wanted), None)
+
+
 def register_envs() -> None:
     """Make the ids known to gymnasium: the twelve ``urlb/<domain>-<task>-v0``, the Jaco tasks' variants,
     ``rwrl/<domain>-walk-<level>-v0`` of the Real-World RL suite, and ``urlb/dm_control-v0`` for any other task of dm_control
@@ -73,37 +101,18 @@ def register_envs() -> None:
     Entry points are strings, so that a spawned process can load them. No ``max_episode_steps``: dm_control truncates, and
     the environment tells its length in its own attribute of that name. May be called again.
     """
-    for domain, tasks in URLB_TASKS.items():
-        for task in tasks:
-            _register(env_id(domain, task))
-    _register("urlb/dm_control-v0")
-    for task in JACO_VARIANT_TASKS:
-        _register(variant_id(task))
-    for domain in RWRL_DOMAINS:
-        for name in rwrl_ids(domain).values():
-            _register(name)
+    for name in _MEANT:
+        # Who is made is not told its id: so that options which contradict it are noticed, it is an argument.
+        _register(name, "make_named_env", {**meant_by(name), NAMED: name})
+    _register("urlb/dm_control-v0", "make_dmc_env", {})
 
 
-def meant_by(name: str) -> dict[str, str]:
-    """What an id of this package says: ``domain`` and ``task``, and ``level`` if it is perturbed. Empty for any other id.
+def _register(name: str, function: str, kwargs: dict[str, str]) -> None:
+    """Register one id, unless it is.
 
     :param name: the id
+    :param function: of the module ``dmc``
+    :param kwargs: its arguments
     """
-    for domain, tasks in URLB_TASKS.items():
-        for level, perturbed in rwrl_ids(domain).items():
-            if name == perturbed:
-                return {"domain": domain, "task": "walk", "level": level}
-        for task in (*tasks, *(JACO_VARIANT_TASKS if domain == "jaco" else ())):
-            if name == f"urlb/{domain}-{task}-v0":
-                return {"domain": domain, "task": task}
-    return {}
-
-
-def _register(name: str) -> None:
-    """Register one id, unless it is."""
     if name not in gymnasium.registry:
-        meant = meant_by(name)
-        # Who is made is not told its id: so that options which contradict it are noticed, it is an argument.
-        kwargs = {**meant, NAMED: name} if meant else {}
-        function = "make_named_env" if meant else "make_dmc_env"
         gymnasium.register(name, entry_point=f"sb3_dreamer_urlb.envs.dmc:{function}", kwargs=kwargs)

@@ -13,8 +13,8 @@ from unittest import mock
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
-from sb3_dreamer_urlb.envs import PRIMAL_TASK, URLB_TASKS, env_id
-from sb3_dreamer_urlb.envs.registration import JACO_VARIANT_TASKS, rwrl_ids, variant_id
+from sb3_dreamer_urlb.envs import PRIMAL_TASK, env_id
+from sb3_dreamer_urlb.envs.registration import meant_by
 from sb3_dreamer_urlb.zoo.resuming import PRETRAINING_LOGS
 
 #: values of the key ``pretrain_env``: the primal task's environment, or the one that is fine-tuned in
@@ -31,13 +31,8 @@ def primal_id(name: str) -> str | None:
 
     :param name: the task's id
     """
-    for domain, tasks in URLB_TASKS.items():
-        names = {env_id(domain, task) for task in tasks} | set(rwrl_ids(domain).values())
-        if domain == "jaco":
-            names |= set(map(variant_id, JACO_VARIANT_TASKS))
-        if name in names:
-            return env_id(domain, PRIMAL_TASK[domain])
-    return None
+    domain = meant_by(name).get("domain")
+    return None if domain is None else env_id(domain, PRIMAL_TASK[domain])
 
 
 def make_envs(make: Callable[[], VecEnv], manager: Any) -> VecEnv:
