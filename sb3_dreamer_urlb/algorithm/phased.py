@@ -202,10 +202,10 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
 
         :param env: the fine-tuning environment; None stays in the same one
-        :param keep_actor: None decides by the task: kept where rewards are dense, dropped for jaco
+        :param keep_actor: None asks :meth:`keeps_actor`
         :param keep_critic: for ablations
-        :param keep_reward: begin with the task's reward head as the pre-training's rewards taught it (paper, appendix
-            "Learning Rewards Online"): of this environment's task, if the pre-training learnt several by name
+        :param keep_reward: for agents that have one: begin with the task's reward head as the pre-training's rewards taught it
+            (paper, appendix "Learning Rewards Online"): of this environment's task, if the pre-training learnt several by name
             (``learn_task_reward``), else that of the *pre-training* environment's task
         :raises ValueError: if the model is not pre-training, there is no such head, or one of these is neither true nor false
         """
@@ -237,7 +237,9 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         self._last_obs = None
 
     def keeps_actor(self) -> bool:
-        """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule."""
+        """Whether fine-tuning keeps the actor where nobody says: the paper's task-aware rule, where rewards are dense, not
+        for jaco.
+        """
         return transfer_rule.keeps_actor(self.domain)
 
     def prepare_fine_tuning_env(self, env: GymEnv) -> VecEnv:

@@ -37,6 +37,9 @@ class DrQv2(AgentAlgorithm):
     are of 84×84 pixels: ``gymnasium.make("urlb/walker-walk-v0", image_size=84)``. Behind a ``VecFrameStack`` write
     ``frame_stack=1``.
 
+    :meth:`fine_tune` keeps encoder, actor and the critic's trunk, in every domain; with ``keep_critic`` the critic's heads,
+    too. There is no reward head to keep.
+
     Units: ``learning_starts``, ``train_freq``, ``noise_std`` and ``buffer_size`` count *agent steps*, as everywhere in SB3;
     ``phase_frames`` counts environment frames (agent steps × action repeat), as in the paper.
 
@@ -241,26 +244,6 @@ class DrQv2(AgentAlgorithm):
         return buffer
 
     # -- phases --------------------------------------------------------------------------------------------------------
-
-    def fine_tune(
-        self,
-        env: GymEnv | None = None,
-        keep_actor: bool | None = None,
-        keep_critic: bool = False,
-        keep_reward: bool = False,
-    ) -> None:
-        """Leave pre-training: encoder, actor and the critic's trunk stay, everything else starts afresh.
-
-        The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
-
-        :param env: the fine-tuning environment; None stays in the same one
-        :param keep_actor: None keeps it, in every domain, as the benchmark does for this agent
-        :param keep_critic: keep the critic's heads, too; for ablations
-        :param keep_reward: False; this agent has no reward head to keep
-        :raises ValueError: if the model is not pre-training, ``keep_reward`` is True, or one of these is neither true nor
-            false
-        """
-        super().fine_tune(env, keep_actor, keep_critic, keep_reward)
 
     def _transfer(self, pretrained: BasePolicy, keep_actor: bool, keep_critic: bool, keep_reward: bool) -> None:
         assert isinstance(pretrained, DrQPolicy)
