@@ -49,15 +49,16 @@ def summary(study: Study, repetitions: int = REPETITIONS) -> Table:
         ],
     )
     stated = published_scores()
-    study.show(arm.scored() for arm in study.approaches())
     for arm in study.approaches():
+        scored = arm.scored()
+        study.show([scored])
         scores = arm.scores(study.normalizer)
         overall = mean_and_error(scores)
         paper_s = stated.get(PAPER_S.get(arm.label, arm.label))
         table.lines.append(
             [
                 arm.label,
-                "/".join(sorted({frames_label(row.pretrain_frames) for row in (arm.scored().rows or arm.rows)})),
+                "/".join(sorted({frames_label(row.pretrain_frames) for row in (scored.rows or arm.rows)})),
                 *(percent(mean_and_error(of_domain(scores, domain))) for domain in list(DOMAINS.values())[1:]),
                 percent(overall),
                 *([with_interval(iqm(scores, repetitions))] if repetitions else []),

@@ -62,9 +62,8 @@ def resolve(conf: str, algorithm: str = FIRST) -> str:
         return str(folder() / f"{known[short]}.yml")
     if not conf.endswith((".yml", ".py")) and _is_module(conf):
         return conf
-    if any(short in names_for(other) for other in (FIRST, *FOLDERS)):
-        other = next(one for one in (FIRST, *FOLDERS) if short in names_for(one))
-        _check_algorithm(conf, names_for(other)[short], algorithm)
+    for other in (FIRST, *FOLDERS):
+        _check_algorithm(conf, names_for(other).get(short), algorithm)
     raise ValueError(
         f"-conf {conf}: no such file, Python module, or configuration of this package: {', '.join(_shortest(algorithm))}."
     )
