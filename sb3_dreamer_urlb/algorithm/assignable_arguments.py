@@ -31,12 +31,9 @@ class AssignableArguments(SavedAlgorithm):
         :raises ValueError: for a value that does not fit; the old one stays
         """
         self._assign(name, value)
-        if name == "policy" or (self.assignable is not None and name in self.assignable):
-            watched = () if self.assignable is None else _watched_arguments(type(self))
-            super().__setattr__(
-                "_dictionaries",
-                {one: plain(value) for one in watched if isinstance(value := vars(self).get(one), dict)},
-            )
+        if self.assignable is not None and "policy" in vars(self) and (name == "policy" or name in self.assignable):
+            found = {one: vars(self).get(one) for one in _watched_arguments(type(self))}
+            super().__setattr__("_dictionaries", {one: plain(its) for one, its in found.items() if isinstance(its, dict)})
 
     def take_over_changes(self) -> None:
         """What was changed within a dictionary was assigned: nobody heard of it.
