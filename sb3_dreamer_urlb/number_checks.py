@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -66,6 +66,11 @@ def check_switch(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be True or False, got {value!r}.")
 
 
+def is_choice(value: Any, choices: Container[str]) -> bool:
+    """Whether ``value`` is one of these words, whatever it is: a list has no hash, an array compares number by number."""
+    return isinstance(value, str) and value in choices
+
+
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     """
     :param name: of the argument, for the message
@@ -73,8 +78,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     :param choices: what it may be
     :raises ValueError: for anything else
     """
-    # An array would be compared number by number.
-    if not isinstance(value, str) or value not in choices:
+    if not is_choice(value, choices):
         raise ValueError(f"{name} must be one of {tuple(choices)}, got {value!r}.")
 
 

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from sb3_dreamer_urlb.number_checks import check_dict, plain
+from sb3_dreamer_urlb.number_checks import check_dict, is_choice, plain
 
 Presets = dict[str, dict[str, Any]]
 #: dictionaries that a user's own extend instead of replacing them
@@ -57,6 +57,6 @@ def find_preset(presets: Presets, name: str) -> dict[str, Any]:
     :param name: what a user wrote
     :raises ValueError: for an unknown name; the message lists the known ones
     """
-    if not isinstance(name, str) or name not in presets:
+    if not is_choice(name, presets):
         raise ValueError(f"Unknown preset {name!r}; known are {sorted(presets)}.")
     return presets[name]

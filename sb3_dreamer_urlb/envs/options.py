@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dreamer_urlb.number_checks import is_integer
+from sb3_dreamer_urlb.number_checks import is_choice, is_integer
 
 _MIN_SIZE, _MAX_SIZE = 16, 512  # pixels
 
@@ -111,6 +111,5 @@ def check_choice(name: str, value: Any, known: Sequence[str], there_are: str = "
     :param there_are: what the message says before it lists them
     :raises ValueError: naming the option, its value and the known ones
     """
-    # Of another type there is no asking "in": a list has no hash, and arrays compare number by number.
-    if not isinstance(value, str) or value not in known:
+    if not is_choice(value, known):
         raise ValueError(f"{name}={value!r}: {there_are} {', '.join(known)}")
