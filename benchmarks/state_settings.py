@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -71,27 +70,17 @@ class Result(NamedTuple):
         return float(np.mean(self.returns[-LAST:]))
 
 
-class Returns(BaseCallback):
-    """Keeps the return of every episode."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[float] = []
-
-    def _on_step(self) -> bool:
-        self.found += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-        return True
-
-
 def learn(setting: str, task: str, seed: int, steps: int) -> Result:
     """One run, or random actions for as long."""
-    env, returns = make_vec_env(f"urlb/walker-{task}-v0", seed=seed, env_kwargs={"observation": "state"}), Returns()
-    env = VecNormalize(env, norm_reward=False)
+    monitored = make_vec_env(f"urlb/walker-{task}-v0", seed=seed, env_kwargs={"observation": "state"})
+    env = VecNormalize(monitored, norm_reward=False)
     preset, changes = {**SETTINGS, **LARGE}.get(setting, ("tiny", {"learning_starts": steps}))
     model = DreamerV2("MlpPolicy", env, preset=preset, seed=seed, device="cpu", intrinsic_reward=None, **changes)
     began = time.process_time()
-    model.learn(steps, returns)
-    return Result(setting, task, seed, steps, time.process_time() - began, tuple(returns.found))
+    model.learn(steps)
+    seconds = time.process_time() - began
+    [returns] = monitored.env_method("get_episode_rewards")
+    return Result(setting, task, seed, steps, seconds, tuple(returns))
 
 
 def read() -> list[Result]:
