@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
+
 MISTAKE, INTERRUPTED = 2, 130
 
 
@@ -23,19 +25,5 @@ def ending_in_a_line(program: str, command: Callable[[], int]) -> int:
     except Exception as error:
         if not is_a_mistake(error):
             raise
-        print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
+        tell(program, error)
         return MISTAKE
-
-
-def is_a_mistake(error: Exception) -> bool:
-    """Whether an error is about what somebody asked for: arguments, files and folders, packages, environments.
-
-    :param error: that a command raised
-    """
-    # Pipes to processes of our own: nobody asked for anything wrong.
-    if isinstance(error, ConnectionError):
-        return False
-    gymnasium = sys.modules.get("gymnasium")
-    return isinstance(error, ValueError | ImportError | OSError) or (
-        gymnasium is not None and isinstance(error, gymnasium.error.Error)
-    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import functools
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,13 +12,11 @@ from types import ModuleType
 from typing import Any
 from unittest import mock
 
-import gymnasium
 import yaml
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 
-#: what checks of arguments raise, here, in Stable-Baselines3, Gymnasium and rl_zoo3, and folders that cannot be written
-CHECKS = (ValueError, ImportError, OSError, gymnasium.error.Error, yaml.YAMLError)
 #: what Python says of arguments that a function does not have, or lacks
 SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
 #: folders of runs that this process has made
@@ -46,11 +43,11 @@ def told_in_a_line(prog: str) -> Iterator[None]:
         try:
             yield
         except Exception as error:
-            if begun or not _is_a_mistake(error):
+            if begun or not (is_a_mistake(error) or _is_of_a_configuration(error)):
                 raise
             for folder in NEW_FOLDERS:
                 shutil.rmtree(folder, ignore_errors=True)
-            print(f"{prog}: {' '.join(str(error).split())}", file=sys.stderr)
+            tell(prog, error)
             raise SystemExit(2) from error
 
 
@@ -63,11 +60,11 @@ def _noted(original: Callable[..., Any], calls: list[bool]) -> Callable[..., Any
     return noted
 
 
-def _is_a_mistake(error: Exception) -> bool:
-    if isinstance(error, AttributeError):  # a class named in a configuration that its module does not have
+def _is_of_a_configuration(error: Exception) -> bool:
+    if isinstance(error, AttributeError):  # a class named there that its module does not have
         return isinstance(error.obj, ModuleType)
     by_python = isinstance(error, TypeError) and any(phrase in str(error) for phrase in SIGNATURE)
-    return by_python or isinstance(error, CHECKS)
+    return by_python or isinstance(error, yaml.YAMLError)
 
 
 def with_values_named(parse: Callable[..., argparse.Namespace]) -> Callable[..., argparse.Namespace]:

@@ -7,6 +7,7 @@ import pytest
 
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
+from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line
 
 
 def raising(error):
@@ -16,6 +17,25 @@ def raising(error):
     return command
 
 
+def own_commands(error):
+    return ending_in_a_line("program", raising(error))
+
+
+def zoo_commands(error):
+    with pytest.raises(SystemExit) as end, told_in_a_line("program"):
+        raise error
+    return end.value.code
+
+
+def zoo_commands_uncaught(error):
+    with told_in_a_line("program"):
+        raise error
+
+
+DOORS = pytest.mark.parametrize("door", [own_commands, zoo_commands])
+
+
+@DOORS
 @pytest.mark.parametrize(
     "error",
     [
@@ -31,17 +51,18 @@ def raising(error):
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_a_mistake_costs_a_line(error, capsys):
-    assert ending_in_a_line("program", raising(error)) == 2
+def test_a_mistake_costs_a_line(door, error, capsys):
+    assert door(error) == 2
     assert capsys.readouterr().err == "program: a b\n"
 
 
+@pytest.mark.parametrize("door", [own_commands, zoo_commands_uncaught])
 @pytest.mark.parametrize(
     "error", [TypeError("a"), KeyError("a"), BrokenPipeError("a"), ConnectionResetError("a"), SystemExit(3)]
 )
-def test_all_else_keeps_its_traceback(error):
+def test_all_else_keeps_its_traceback(door, error):
     with pytest.raises(type(error)):
-        ending_in_a_line("program", raising(error))
+        door(error)
 
 
 @pytest.mark.parametrize(("args", "line"), [((), "interrupted."), (("it goes on",), "it goes on")])
