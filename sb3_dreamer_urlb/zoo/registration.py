@@ -32,7 +32,7 @@ from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
-from sb3_dreamer_urlb.zoo import configs, env_arguments, mistakes, pretraining, resuming
+from sb3_dreamer_urlb.zoo import configs, env_arguments, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
@@ -104,6 +104,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     env_arguments.merge(manager, given, hyperparams, config)
     if manager.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
         raise ValueError(f"How long? Neither -n nor n_timesteps of {manager.env_name.gym_id} in {manager.config} says so.")
+    hyperparams.setdefault("n_timesteps", manager.n_timesteps)  # -n is enough, rl_zoo3 wants both
     resume = hyperparams.pop("resume", None) or getattr(options, "resume", None)
     checkpoint = hyperparams.pop("checkpoint", True)
     manager.pretrain_env = hyperparams.pop("pretrain_env", pretraining.PRIMAL)
@@ -135,9 +136,8 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
 
     :raises ValueError: naming what may have been meant
     """
-    given = hyperparams.get("learning_rate")
-    if isinstance(given, str) and not given.startswith("lin_"):
-        raise ValueError(f"learning_rate must be a number or 'lin_' and a number, got {given!r}.")
+    known = named_parameters(ALGORITHMS[manager.algo].kind)
+    lines = schedules.of_rates(hyperparams, known)
     for name in WHOLE_NUMBERS & set(hyperparams):
         check_integer(name, hyperparams[name], 1)
     env_arguments.use_everywhere(manager, hyperparams.get("env_kwargs"))
@@ -147,12 +147,12 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
         raise ValueError(f"A value that is read as Python cannot be: {error}.") from error
     if "policy" not in found[0]:
         raise ValueError(f"The hyperparameters of {manager.env_name.gym_id} in {manager.config} name no policy.")
-    known = named_parameters(ALGORITHMS[manager.algo].kind)
     for name in found[0]:
         if name not in known and name not in OWN_KEYS:
             meant = difflib.get_close_matches(name, [*known, *OWN_KEYS])
             hint = f"; did you mean {' or '.join(meant)}?" if meant else f": neither of rl_zoo3's nor of {manager.algo}'s."
             raise ValueError(f"Unknown hyperparameter {name!r}{hint}")
+    found[0].update(lines)
     return found
 
 

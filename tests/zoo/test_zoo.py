@@ -289,6 +289,7 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("preset:tiny", "NameError: name 'tiny' is not defined. Values of -params"),
         ("batch_size:-1", "batch_size must be an integer of at least 1, got -1"),
         ("learning_rate:'fast'", "learning_rate must be a number or 'lin_' and a number, got 'fast'"),
+        ("actor_learning_rate:'lin_-1'", "with 1 of the run left it gives -1.0"),
         ("n_envs:'two'", "n_envs must be an integer of at least 1, got 'two'"),
         ("frame_stack:0", "frame_stack must be an integer of at least 1, got 0"),
         ("normalize:'yes please'", "A value that is read as Python cannot be"),
