@@ -37,3 +37,26 @@ def named_arguments(kind: type, args: Sequence[Any], kwargs: Mapping[str, Any]) 
     """
     names = [name for name, parameter in named_parameters(kind).items() if parameter.kind in POSITIONAL]
     return {**dict(zip(names, args, strict=False)), **kwargs}
+
+
+def constructed(kind: Any, first: Mapping[str, Any], **others: Any) -> Any:
+    """Call a constructor as Stable-Baselines3 does, with some arguments in front, or by name where it wants them so.
+
+    :param kind: the class
+    :param first: the arguments in front, in their order
+    :param others: by name
+    """
+    if _by_position(kind, list(first)):
+        return kind(*first.values(), **others)
+    return kind(**first, **others)
+
+
+def _by_position(kind: type, first: list[str]) -> bool:
+    """Whether a constructor can only take its first arguments without their names: it hides them, or calls them otherwise."""
+    _, *parameters = inspect.signature(kind.__init__).parameters.values()  # type: ignore[misc]
+    named = [parameter.name for parameter in parameters if parameter.kind in POSITIONAL]
+    if any(parameter.kind == inspect.Parameter.POSITIONAL_ONLY for parameter in parameters):
+        return True
+    if any(parameter.kind == inspect.Parameter.VAR_POSITIONAL for parameter in parameters):
+        return named == first[: len(named)]
+    return len(named) >= len(first) > 0 and not set(named) & set(first)

@@ -54,6 +54,22 @@ class AgentAlgorithm(PhasedAlgorithm):
         self._acting_state = None
         self._metrics = MetricMeans()
 
+    def _first_of_policy(self) -> dict[str, Any]:
+        """The arguments in front of every policy's, as Stable-Baselines3 gives them."""
+        return {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "lr_schedule": self.lr_schedule,
+        }
+
+    def _first_of_replay(self) -> dict[str, Any]:
+        """The arguments in front of every replay's, as Stable-Baselines3 gives them."""
+        return {
+            "buffer_size": self.buffer_size,
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+        }
+
     def _about(self) -> Iterator[str]:
         """What a user wants to know of what was built."""
         yield f"Products of updates in {self.learner.dtype}"

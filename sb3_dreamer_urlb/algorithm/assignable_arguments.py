@@ -6,9 +6,13 @@ import functools
 from typing import Any, ClassVar
 
 import numpy as np
+from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb.number_checks import plain
-from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm
+
+#: an argument that files do not hold
+DEVICE = "device"
 
 
 class AssignableArguments(SavedAlgorithm):
@@ -51,9 +55,11 @@ class AssignableArguments(SavedAlgorithm):
         if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
             super().__setattr__(name, value)
             return
+        if name == DEVICE and get_device(value) == self.device:
+            return
         if name not in self.assignable:
             raise AttributeError(
-                f"{name} cannot be assigned: the model was built with {name}={vars(self).get(name)!r}. "
+                f"{name} cannot be assigned: the model was built with {name}={self._as_built(name)!r}. "
                 f"To change it: {self._how_to_change(name)}."
             )
         before = vars(self)[name]
@@ -63,6 +69,9 @@ class AssignableArguments(SavedAlgorithm):
         except Exception:
             super().__setattr__(name, before)
             raise
+
+    def _as_built(self, name: str) -> Any:
+        return str(self.device) if name == DEVICE else vars(self).get(ATTRIBUTES.get(name, name))
 
     def _how_to_change(self, name: str) -> str:
         """What works for an argument that cannot be assigned."""
@@ -95,4 +104,4 @@ def same(a: Any, b: Any) -> bool:
 def _watched_arguments(algorithm: type[AssignableArguments]) -> frozenset[str]:
     """The arguments of the class that says which of them may be assigned; what subclasses add is their own affair."""
     owner = next(kind for kind in algorithm.__mro__ if "assignable" in vars(kind))
-    return frozenset(owner.argument_names())  # type: ignore[attr-defined]
+    return frozenset({*owner.argument_names(), DEVICE})  # type: ignore[attr-defined]

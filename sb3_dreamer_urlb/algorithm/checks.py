@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import gymnasium
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_dreamer_urlb.envs.normalized import hides_originals
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import (
@@ -57,15 +60,41 @@ def check_learn(total_timesteps: Any, log_interval: Any) -> None:
         check_integer("log_interval", log_interval, 1)
 
 
-def check_has_numbers(env: Any) -> None:
-    """Before Stable-Baselines3 makes an array for observations.
+def check_given_env(env: Any) -> None:
+    """Before Stable-Baselines3 wraps it, and makes arrays for its observations.
 
     :param env: what was given as environment
     :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
+    :raises ValueError: for environments that Gymnasium vectorised
     """
+    if isinstance(env, gymnasium.vector.VectorEnv):
+        raise ValueError(
+            f"env is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 does: "
+            "make it with make_vec_env, DummyVecEnv or SubprocVecEnv of stable_baselines3."
+        )
     space = getattr(env, "observation_space", None)
-    if isinstance(space, spaces.Space) and not isinstance(space, spaces.Dict | spaces.Tuple) and space.shape is None:
-        raise UnsupportedSpaceError(f"Observations must be arrays of numbers, or several by name in a Dict, got {space}.")
+    parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
+    for name, part in parts:
+        if isinstance(part, spaces.Space) and not isinstance(part, spaces.Dict | spaces.Tuple) and part.shape is None:
+            which = f"The observation {name!r} must be an array" if name else "Observations must be arrays"
+            raise UnsupportedSpaceError(f"{which} of numbers, or several by name in a Dict, got {part}.")
+
+
+def check_keeps_fractions(env: VecEnv) -> None:
+    """
+    :param env: vectorised
+    :raises UnsupportedSpaceError: where a wrapper outside of VecNormalize says that observations are whole numbers
+    """
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None or not normalizer.norm_obs or not hides_originals(env, normalizer):
+        return
+    space: Any = env.observation_space
+    for part in space.spaces.values() if isinstance(space, spaces.Dict) else [space]:
+        if isinstance(part, spaces.Box) and not np.issubdtype(part.dtype, np.floating):
+            raise UnsupportedSpaceError(
+                f"VecNormalize gives fractions, and the wrapper outside of it says that they are {part.dtype}: {part}. "
+                "Put VecNormalize outermost, or let the environment give float32."
+            )
 
 
 def check_settings(model: SavedAlgorithm) -> None:

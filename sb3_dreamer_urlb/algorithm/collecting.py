@@ -14,14 +14,15 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import should_collect_more_steps
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm import left_environments
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
+from sb3_dreamer_urlb.algorithm.training_loop import LearningVecEnv
 from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
-from sb3_dreamer_urlb.envs.normalized import RewardsOnly, hides_originals
+from sb3_dreamer_urlb.envs.normalized import TERMINAL, RewardsOnly, hides_originals, original_end, original_observations
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.spaces.actions import make_actions
 
@@ -83,7 +84,7 @@ class CollectingAlgorithm(SavingAlgorithm):
         """As SB3's, but a step is kept before anybody hears of it, and only where the environment stands as it was left.
 
         So whatever callbacks do (stop, raise, evaluate in these very environments), rows of an episode followed each other.
-        The rollout also ends where a callback brought another environment or replay.
+        The rollout also ends where a callback brought another environment, another wrapper of it, or another replay.
 
         :param env: the model's
         :param callback: told as SB3 tells it, with the same names in ``locals``
@@ -98,11 +99,12 @@ class CollectingAlgorithm(SavingAlgorithm):
             "You must use only one env when doing episodic training."
         )
         self.policy.set_training_mode(False)
+        going_on_in = env.venv if isinstance(env, LearningVecEnv) else env
         num_collected_steps, num_collected_episodes = 0, 0
         continue_training = True
         callback.on_rollout_start()
         while should_collect_more_steps(train_freq, num_collected_steps, num_collected_episodes):
-            if self.env.unwrapped is not env.unwrapped or self.replay_buffer is not replay_buffer:
+            if self.env is not going_on_in or self.replay_buffer is not replay_buffer:
                 break
             if self._last_obs is None or self._was_touched():
                 self.restart_episodes()
@@ -179,12 +181,11 @@ class CollectingAlgorithm(SavingAlgorithm):
             self._last_original_obs, original_obs = self._last_obs, new_obs
         else:
             original_obs, reward = self._original_obs(new_obs), normalizer.get_original_reward()
-        undoes = normalizer is not None and not self._keeps_what_was_seen()
         self.env_faults += env_steps.count_faults(infos)
         # The VecEnv has already begun the next episode: put the true last observation back.
         next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
-            _put(next_obs, int(i), self._last_of_episode(int(i), infos[i], normalizer if undoes else None))
+            _put(next_obs, int(i), self._last_of_episode(int(i), infos[i]))
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
@@ -194,16 +195,17 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._last_episode_starts = dones.astype(bool)
         self._leave_standing()
 
-    def _last_of_episode(self, i: int, info: dict[str, Any], normalizer: VecNormalize | None) -> Any:
-        """The observation with which environment ``i`` ended its episode.
+    def _last_of_episode(self, i: int, info: dict[str, Any]) -> Any:
+        """The observation with which environment ``i`` ended its episode, as the replay keeps it.
 
         :param i: number of the environment
         :param info: of the last step
-        :param normalizer: to undo, None if there is nothing to undo
         """
-        last = info.get("terminal_observation")
+        assert self.env is not None
+        normalizer = None if self._keeps_what_was_seen() else self._vec_normalize_env
+        last = info.get(TERMINAL) if normalizer is None else original_end(self.env, normalizer, i)
         if last is not None:
-            return last if normalizer is None else normalizer.unnormalize_obs(last)
+            return last
         if not env_steps.is_fault(info):
             warnings.warn(
                 "The vectorised environment ends an episode without info['terminal_observation']: nobody knows its last "
@@ -261,8 +263,8 @@ class CollectingAlgorithm(SavingAlgorithm):
         """
         if self._vec_normalize_env is None or self._keeps_what_was_seen():
             return seen
-        original = self._vec_normalize_env.get_original_obs()
-        return self.env.transpose_observations(original) if isinstance(self.env, VecTransposeImage) else original
+        assert self.env is not None
+        return original_observations(self.env, self._vec_normalize_env)
 
 
 def _put(observations: np.ndarray | dict[str, np.ndarray], i: int, observation: np.ndarray | dict[str, np.ndarray]) -> None:

@@ -15,11 +15,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases, transfer_rule
-from sb3_dreamer_urlb.algorithm import checks, normalized, training_loop
+from sb3_dreamer_urlb.algorithm import checks, left_environments, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
+from sb3_dreamer_urlb.envs.normalized import watch_ends
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
@@ -27,6 +28,7 @@ from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.snapshots import normalization
+from sb3_dreamer_urlb.snapshots.saved_algorithm import builds_networks
 from sb3_dreamer_urlb.types import MetricMeans
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
@@ -71,7 +73,6 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         for name in ("policy_kwargs", "replay_buffer_kwargs"):
             # Stable-Baselines3 takes whatever is false for an empty one.
             check_dict(name, kwargs.get(name))
-        checks.check_has_numbers(env)
         super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
         self.intrinsic_reward = intrinsic_reward
         self.overlap = overlap
@@ -104,6 +105,8 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     # -- set-up --------------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
+        if not builds_networks():
+            return
         self._prepare()
         self.set_random_seed(self.seed)
         self._build()
@@ -146,6 +149,13 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     # -- environments --------------------------------------------------------------------------------------------------
 
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        checks.check_given_env(env)
+        wrapped = CollectingAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        checks.check_keeps_fractions(wrapped)
+        return wrapped
+
     def prepare_env(self, env: GymEnv) -> VecEnv:
         """Wrap an environment as SB3 does, and check that this model can go on in it.
 
@@ -163,11 +173,14 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         """As SB3's; also checks what else the model needs of it, and reads the new environment's action repeat.
 
         :param env: with the model's number of environments and its spaces
-        :param force_reset: reset it before going on
+        :param force_reset: reset it before going on; False does not if it stands where the model left it, wrapped as then
         :raises ValueError: if it does not fit; the model stays as it is
         """
         wrapped, known = self.prepare_env(env), self._known_statistics()
         super().set_env(wrapped, force_reset)
+        if left_environments.found(wrapped) is None:
+            # What was seen last, was seen elsewhere, or through other wrappers.
+            self._last_obs = None
         self._read_env()
         self._go_on_normalized(known)
 
@@ -185,6 +198,8 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
             return
         # Watched from now on, also while others step it.
         last_touches(self.env)
+        if self._vec_normalize_env is not None:
+            watch_ends(self._vec_normalize_env)
         self.action_repeat = env_fact(self.env, "action_repeat", 1)
         self.domain = env_fact(self.env, "domain", None)
 

@@ -26,6 +26,7 @@ from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.planning import Planner, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
+from sb3_dreamer_urlb.signatures import constructed
 from sb3_dreamer_urlb.spaces.actions import make_actions
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
@@ -268,10 +269,9 @@ class DreamerV2(AgentAlgorithm):
         return Learner(self.policy.agent, self._learner_config())
 
     def _new_policy(self) -> DreamerPolicy:
-        return self.policy_class(
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
+        policy: DreamerPolicy = constructed(
+            self.policy_class,
+            self._first_of_policy(),
             gamma=self.gamma,
             discount_head=bool(self.discount_head),
             intrinsic=self._intrinsic(),
@@ -282,6 +282,7 @@ class DreamerV2(AgentAlgorithm):
             compile=self.compile,
             **self.policy_kwargs,
         )
+        return policy
 
     def _new_planner(self) -> Planner | None:
         return make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes)
@@ -320,11 +321,9 @@ class DreamerV2(AgentAlgorithm):
         )
 
     def _new_replay_buffer(self) -> SequenceReplayBuffer:
-        buffer_class: Any = self.replay_buffer_class or SequenceReplayBuffer
-        buffer: SequenceReplayBuffer = buffer_class(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
+        buffer: SequenceReplayBuffer = constructed(
+            self.replay_buffer_class or SequenceReplayBuffer,
+            self._first_of_replay(),
             device=self.device,
             n_envs=self.n_envs,
             **{

@@ -20,6 +20,7 @@ from sb3_dreamer_urlb.drq_v2.policies import CnnPolicy, DrQPolicy, MlpPolicy
 from sb3_dreamer_urlb.drq_v2.presets import with_preset
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
+from sb3_dreamer_urlb.signatures import constructed
 
 SelfDrQv2 = TypeVar("SelfDrQv2", bound="DrQv2")
 
@@ -198,15 +199,15 @@ class DrQv2(AgentAlgorithm):
         return method
 
     def _new_policy(self) -> DrQPolicy:
-        return self.policy_class(
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
+        policy: DrQPolicy = constructed(
+            self.policy_class,
+            self._first_of_policy(),
             frame_stack=self.frame_stack,
             noise_std=self._noise(),
             intrinsic=self._intrinsic(),
             **self.policy_kwargs,
         )
+        return policy
 
     def _new_learner(self) -> DrQLearner:
         untrained = self.pretrained_frames == 0 and not phases.PHASES[self.phase].explores
@@ -229,11 +230,9 @@ class DrQv2(AgentAlgorithm):
         )
 
     def _new_replay_buffer(self) -> NStepFrameReplayBuffer:
-        buffer_class: Any = self.replay_buffer_class or NStepFrameReplayBuffer
-        buffer: NStepFrameReplayBuffer = buffer_class(
-            self.buffer_size,
-            self.observation_space,
-            self.action_space,
+        buffer: NStepFrameReplayBuffer = constructed(
+            self.replay_buffer_class or NStepFrameReplayBuffer,
+            self._first_of_replay(),
             device=self.device,
             n_envs=self.n_envs,
             frame_stack=self._frames(),

@@ -9,16 +9,14 @@ processes can only be touched by a method that their ``VecEnv`` is told to call 
 from __future__ import annotations
 
 import copy
-import functools
 import itertools
-import types
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dreamer_urlb.envs.intercepting import intercept
 from sb3_dreamer_urlb.envs.visiting import Visitor, visited
 
 #: attribute with the number of the last touch; numbers are never given twice, so they tell environments apart, too
@@ -38,10 +36,10 @@ def last_touches(env: VecEnv) -> tuple[int, ...]:
     innermost = env.unwrapped
     members = getattr(innermost, "envs", ())
     owners: list[Any] = [innermost]
-    _intercept(innermost, VEC_ENV_METHODS, _count)
+    intercept(innermost, VEC_ENV_METHODS, _count)
     if isinstance(members, list | tuple) and members:
         owners += map(_watch, members)
-    elif _intercept(innermost, (CALLS_INSIDE,), _count_what_it_touched):
+    elif intercept(innermost, (CALLS_INSIDE,), _count_what_it_touched):
         _touched_inside(innermost)  # watched from now on, there, too
     return tuple(vars(owner).setdefault(TOUCHED, next(_numbers)) for owner in owners if hasattr(owner, "__dict__"))
 
@@ -49,8 +47,8 @@ def last_touches(env: VecEnv) -> tuple[int, ...]:
 def _watch(env: Any) -> Any:
     """:return: the innermost environment, which counts"""
     innermost = getattr(env, "unwrapped", env)
-    _intercept(env, ("step",), _hand_over_a_copy)
-    _intercept(innermost, ENV_METHODS, _count)
+    intercept(env, ("step",), _hand_over_a_copy)
+    intercept(innermost, ENV_METHODS, _count)
     return innermost
 
 
@@ -105,41 +103,3 @@ def with_own_observation(step: tuple[Any, ...]) -> tuple[Any, ...]:
     if not (terminated or truncated):
         return step
     return copy.deepcopy(observation), reward, terminated, truncated, dict(info)
-
-
-def _intercept(owner: Any, names: Sequence[str], around: Callable[..., Any]) -> bool:
-    """Let calls of methods go through ``around``, once; objects that take no attributes are left alone.
-
-    What is put into the instance is a method bound to it: in a deep copy it is bound to the copy.
-
-    :return: whether any does so only from now on
-    """
-    new = False
-    for name in names:
-        mine = getattr(owner, "__dict__", {}).get(name)
-        if around in getattr(mine, "interceptors", ()):
-            continue
-        with suppress(AttributeError, TypeError):
-            setattr(owner, name, types.MethodType(_interceptor(owner, name, mine, around), owner))
-            new = True
-    return new
-
-
-def _interceptor(owner: Any, name: str, mine: Any, around: Callable[..., Any]) -> Callable[..., Any]:
-    on_class = mine is None and hasattr(type(owner), name)
-    found: Any = None if on_class else getattr(owner, name)
-
-    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
-        original: Callable[..., Any]
-        if on_class:
-            original = functools.partial(getattr(type(self), name), self)
-        elif isinstance(found, types.MethodType) and found.__self__ is owner:
-            original = functools.partial(found.__func__, self)
-        else:
-            original = found
-        return around(self, original, *args, **kwargs)
-
-    # A pickle of the bound method looks it up by its name.
-    method.__name__ = name
-    method.interceptors = (*getattr(mine, "interceptors", ()), around)  # type: ignore[attr-defined]
-    return method

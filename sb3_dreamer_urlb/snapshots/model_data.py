@@ -9,14 +9,15 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch as th
+from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer
+from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
 from sb3_dreamer_urlb.planning import Planner
-from sb3_dreamer_urlb.signatures import named_parameters
+from sb3_dreamer_urlb.signatures import constructed, named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.random_state import capture
-from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
+from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm, without_networks
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 
@@ -30,6 +31,8 @@ FIELDS = {
 }  # fmt: skip
 #: what a fine-tuning may begin with, beside the world model
 KEPT = {"actor", "critic", "reward"}
+#: arguments that every constructor of an algorithm takes in front
+FIRST = ("policy", "env")
 MAX_ENVS = 65_536
 #: whose statistics are kept
 MAX_EPISODES = 1000
@@ -86,7 +89,8 @@ def describe_arguments(model: SavedAlgorithm) -> dict[str, Any]:
     """The constructor arguments of a model, as JSON."""
     arguments = model.arguments()
     for name in sorted(set(model.argument_names()) - set(arguments)):
-        warnings.warn(f"{type(model).__name__} has no attribute {name!r}: its file leaves that argument out.")
+        what = f"{type(model).__name__} has no attribute {name!r}"
+        warnings.warn(f"{what}: its file leaves that argument out. To keep it: self.{name} = {name}.")
     arguments["train_freq"] = (model.train_freq.frequency, model.train_freq.unit.value)  # type: ignore[union-attr]
     return {name: values.encode_or_describe(value) for name, value in arguments.items()}
 
@@ -138,7 +142,8 @@ def blank(
         )
     # The stored arguments are complete: the preset must not fill anything in.
     preset = decoded.pop("preset", "paper")
-    model = _constructed(algorithm, policy, {"device": device, "preset": "paper", **decoded})
+    given_by_us = {"policy": policy, "env": None, "device": get_device(device), "_init_setup_model": False}
+    model = _constructed(algorithm, {**given_by_us, "preset": "paper", **decoded})
     model.preset = preset
     return model
 
@@ -155,19 +160,35 @@ def _extended(name: str, stored: Any, given: Any) -> Any:
     return given
 
 
-def _constructed(algorithm: type[Model], policy: Any, arguments: dict[str, Any]) -> Model:
-    """Without networks. An argument that a subclass fixes itself, and so hands on twice, is none of its own."""
-    constructor: Any = algorithm
-    arguments = {name: value for name, value in arguments.items() if name in named_parameters(algorithm)}
+def _constructed(algorithm: type[Model], arguments: dict[str, Any]) -> Model:
+    """Without networks. What a subclass decides itself, and does not let itself be told, it is told afterwards.
+
+    :param algorithm: the class
+    :param arguments: of all that the class extends, by name
+    :raises ValueError: if a subclass cannot be made so
+    """
+    told = {name: value for name, value in arguments.items() if name in named_parameters(algorithm)}
     while True:
+        first = {name: told[name] for name in FIRST if name in told}
+        others = {name: value for name, value in told.items() if name not in first}
         try:
-            model: Model = constructor(policy, None, _init_setup_model=False, **arguments)
-            return model
-        except TypeError as error:
+            with without_networks():
+                model: Model = constructed(algorithm, first, **others)
+            break
+        except (TypeError, AttributeError) as error:
             twice = re.search(r"multiple values for (?:keyword )?argument '(\w+)'", str(error))
-            if twice is None or twice[1] not in arguments:
-                raise
-            del arguments[twice[1]]
+            if twice is None or twice[1] not in told:
+                raise ValueError(
+                    f"{algorithm.__name__} cannot be made as files are read, with env=None and those of its arguments that "
+                    f"the model keeps as attributes of the same names: {error}"
+                ) from error
+            del told[twice[1]]
+    for name in arguments.keys() - told.keys() - {"policy", "env", "_init_setup_model"}:
+        attribute, value = ATTRIBUTES.get(name, name), plain(arguments[name])
+        # Stable-Baselines3's constructors make dictionaries of None.
+        empty = value is None and isinstance(getattr(model, attribute, None), dict)
+        setattr(model, attribute, {} if empty else value)
+    return model
 
 
 def _check_method(stored: dict[str, Any], given: dict[str, Any]) -> None:

@@ -15,6 +15,8 @@ from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
 
 Policy = TypeVar("Policy", bound=BasePolicy)
 KIND = "policy"
+#: arguments that a policy without its algorithm has no use for
+LEFT_OUT = {"self", "lr_schedule"}
 
 
 def save(policy: BasePolicy, target: Target) -> None:
@@ -24,11 +26,20 @@ def save(policy: BasePolicy, target: Target) -> None:
     :param target: path or binary file object
     :raises ValueError: if a weight is not finite
     """
-    parameters = {name: value for name, value in policy._get_constructor_parameters().items() if name != "lr_schedule"}
+    parameters = _parameters(policy)
     content = tensors.pack(policy.state_dict())
     with writing(target, KIND, suffix="") as writer:
         writer.add(TENSORS, content)
         writer.finish({"parameters": {name: values.encode_or_describe(value) for name, value in parameters.items()}})
+
+
+def _parameters(policy: BasePolicy) -> dict[str, Any]:
+    """What a policy says that its constructor takes, and arguments of subclasses that they keep under the same name."""
+    said = policy._get_constructor_parameters()
+    own = {
+        name: getattr(policy, name) for name in named_parameters(type(policy)) if name not in said and hasattr(policy, name)
+    }
+    return {name: value for name, value in {**said, **own}.items() if name not in LEFT_OUT}
 
 
 def load(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -18,6 +22,23 @@ from sb3_dreamer_urlb.signatures import named_parameters
 NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
 #: arguments whose attribute SB3 calls otherwise
 ATTRIBUTES = {"stats_window_size": "_stats_window_size"}
+#: whether a constructor builds networks, where it is not told by ``_init_setup_model``
+_builds: ContextVar[bool] = ContextVar("_builds", default=True)
+
+
+@contextmanager
+def without_networks() -> Iterator[None]:
+    """Inside, no constructor builds any: those of subclasses may not hand ``_init_setup_model`` on."""
+    before = _builds.set(False)
+    try:
+        yield
+    finally:
+        _builds.reset(before)
+
+
+def builds_networks() -> bool:
+    """Whether a constructor may build them now."""
+    return _builds.get()
 
 
 class SavedAlgorithm(OffPolicyAlgorithm):
@@ -64,8 +85,9 @@ class SavedAlgorithm(OffPolicyAlgorithm):
 
     @classmethod
     def argument_names(cls) -> list[str]:
-        """The constructor arguments that files hold."""
-        return [name for name in named_parameters(cls) if name not in NOT_STORED]
+        """The constructor arguments that files hold: its own, and those that it decides for the class that it extends."""
+        concrete = itertools.takewhile(lambda kind: not inspect.isabstract(kind), cls.__mro__)
+        return [name for name in dict.fromkeys(itertools.chain(*map(named_parameters, concrete))) if name not in NOT_STORED]
 
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments, as the model has them now; without those that a subclass keeps nowhere."""

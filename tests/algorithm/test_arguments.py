@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 
+import gymnasium
 import numpy as np
 import pytest
 import torch as th
@@ -309,3 +310,49 @@ def test_a_schedule_that_ends_badly_changes_no_weights(algorithm, policy, replay
     with pytest.raises(ValueError, match=r"The schedule of .* must give non-negative numbers: with 0.* of the run left it"):
         model.learn(60)
     assert all(th.isfinite(weight).all() for weight in model.policy.parameters())
+
+
+# -- environments ----------------------------------------------------------------------------------------------------------
+
+WRONG_ENVS = {
+    "gymnasium's vectorised": (
+        lambda: gymnasium.vector.SyncVectorEnv([CounterEnv] * 2),
+        "env is vectorised by Gymnasium, a SyncVectorEnv.*make it with make_vec_env",
+    ),
+    "text in a Dict": (
+        lambda: CounterEnv(observation_space=spaces.Dict({"a": spaces.Text(3), "b": spaces.Discrete(2)})),
+        "The observation 'a' must be an array of numbers.*got Text",
+    ),
+    "a sequence": (lambda: CounterEnv(observation_space=spaces.Sequence(spaces.Discrete(2))), "must be arrays.*got Sequence"),
+}
+
+
+@each
+@pytest.mark.parametrize(("wrong", "message"), WRONG_ENVS.values(), ids=WRONG_ENVS)
+def test_an_environment_that_will_not_do_is_named_wherever_it_is_given(
+    algorithm, policy, replay, method, wrong, message, tmp_path
+):
+    model = make(algorithm, intrinsic_reward=method)
+    model.save(tmp_path / "m")
+    ways = (
+        lambda: algorithm("CnnPolicy", wrong(), preset="tiny"),
+        lambda: model.set_env(wrong()),
+        lambda: model.fine_tune(wrong()),
+        lambda: algorithm.load(tmp_path / "m", wrong(), device="cpu"),
+    )
+    for way in ways:
+        with pytest.raises(ValueError, match=message):
+            way()
+    assert model.phase == "pretraining"
+
+
+@each
+def test_the_device_is_not_assigned(algorithm, policy, replay, method, tmp_path):
+    model = make(algorithm)
+    model.device = "cpu"  # it is there
+    assert model.device == th.device("cpu")
+    with pytest.raises(AttributeError, match=r"device cannot be assigned: .* device='cpu'.*load\(path, device=\.\.\.\)"):
+        model.device = "meta"
+    with pytest.raises(AttributeError, match="stats_window_size=100"):
+        model.stats_window_size = 7
+    model.save(tmp_path / "m")
