@@ -18,6 +18,7 @@ import io
 import os
 import re
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -41,6 +42,8 @@ LIMITS = {DATA: 4 << 20, MANIFEST: 4 << 20, SB3_VERSION: 64, SYSTEM_INFO: 16 << 
 #: of the zip's table of contents
 MAX_MEMBERS, MAX_DIRECTORY = 10_000, 2 << 20
 BLOCK = 1 << 20
+#: bytes that are kept in memory until a file object gets them
+SPOOLED = 64 << 20
 
 Target = str | os.PathLike[str] | io.IOBase | BinaryIO
 
@@ -102,7 +105,7 @@ def _info(name: str) -> zipfile.ZipInfo:
 
 @contextmanager
 def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
-    """Write an archive: to a path atomically, to a file object directly.
+    """Write an archive: to a path atomically, to a file object from its position on, once all is there.
 
     :param target: path, or binary file object
     :param kind: see :class:`Writer`
@@ -114,11 +117,27 @@ def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
         _check_no_other_kind(path, kind)
         with written_atomically(path) as file, Writer(file, kind) as writer:
             yield writer
-    elif hasattr(target, "write"):
-        with Writer(target, kind) as writer:  # type: ignore[arg-type]
-            yield writer
+    elif hasattr(target, "write") and not isinstance(target, io.TextIOBase):
+        # A zip goes back to its members' beginnings: streams that append, compress or send cannot.
+        with tempfile.SpooledTemporaryFile(SPOOLED) as file:
+            with Writer(file, kind) as writer:  # type: ignore[arg-type]
+                yield writer
+            file.seek(0)
+            while block := file.read(BLOCK):
+                _write_all(target, block)
     else:
-        raise TypeError(f"Expected a path or a binary file object to save to, got {target!r}.")
+        raise TypeError(f"Expected a path or a binary file object to save to, got {_shown(target)}.")
+
+
+def _write_all(target: Any, block: bytes) -> None:
+    while block:
+        # Raw streams may take less than they are given, and tell; others tell nothing.
+        written = target.write(block)
+        block = block[written:] if isinstance(written, int) else b""
+
+
+def _shown(value: Any) -> str:
+    return f"{type(value).__name__} {str(value)[:80]!r}"
 
 
 def _check_no_other_kind(path: Path, kind: str) -> None:
@@ -236,13 +255,13 @@ def reading(source: Target, kind: str, suffix: str = "zip") -> Iterator[Archive]
         path = path_to_read(source, suffix)
         with open(path, "rb") as file, blaming(str(path)):
             yield Archive(str(path), file, kind)
-    elif hasattr(source, "read"):
+    elif hasattr(source, "read") and not isinstance(source, io.TextIOBase):
         stream: Any = source if source.seekable() else io.BytesIO(source.read())
         name = f"file object {getattr(source, 'name', '')}".strip()
         with blaming(name):
             yield Archive(name, stream, kind)
     else:
-        raise TypeError(f"Expected a path or a binary file object to load from, got {source!r}.")
+        raise TypeError(f"Expected a path or a binary file object to load from, got {_shown(source)}.")
 
 
 @contextmanager

@@ -6,7 +6,7 @@ Each ``rows-…`` member holds whole episodes: their lengths and, one after the 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +28,24 @@ FIELDS = {*NUMBERS, "observation_space", "action_space", "phase", "sampler", "st
 
 
 def save(buffer: SequenceReplayBuffer, target: Target) -> None:
-    """Write a whole replay buffer.
+    """Write a whole replay buffer; from another thread than the one that fills it, too, but then an episode that ends just now
+    may be missing.
 
     :param buffer: open episodes are stored, too
     :param target: path (``.zip`` is added where it has no suffix), or binary file object
     """
-    write(buffer, target, [*buffer.episodes, *(episode for episode in buffer.open if episode is not None)])
+    finished, open_ = list(buffer.episodes), dict(enumerate(buffer.open))
+    open_ = {i: episode for i, episode in open_.items() if episode is not None}
+    write(buffer, target, [*finished, *open_.values()], list(open_))
 
 
-def write(buffer: SequenceReplayBuffer, target: Target, episodes: Iterable[Episode]) -> None:
+def write(buffer: SequenceReplayBuffer, target: Target, episodes: Iterable[Episode], streams: Sequence[int] = ()) -> None:
     """Write some episodes of a buffer.
 
     :param buffer: describes them
     :param target: see :func:`save`
     :param episodes: in their order
+    :param streams: which environment each open episode, the last of them all, belongs to
     """
     with writing(target, KIND) as writer:
         for number, group in enumerate(_groups(episodes)):
@@ -53,8 +57,7 @@ def write(buffer: SequenceReplayBuffer, target: Target, episodes: Iterable[Episo
                 "action_space": values.encode(buffer.action_space),
                 "phase": buffer.phase,
                 "sampler": generator_state(buffer.rng),
-                # which environment each open episode, the last of them all, belongs to
-                "streams": [i for i, episode in enumerate(buffer.open) if episode is not None],
+                "streams": list(streams),
             }
         )
 
@@ -73,9 +76,11 @@ def _groups(episodes: Iterable[Episode]) -> Iterator[list[Episode]]:
 
 
 def _pack(buffer: SequenceReplayBuffer, group: list[Episode]) -> bytes:
-    rows = [episode.rows(0, len(episode)) for episode in group]
+    # Once for all columns: an open episode may be growing.
+    lengths = [len(episode) for episode in group]
+    rows = [episode.rows(0, length) for episode, length in zip(group, lengths, strict=True)]
     columns = {name: np.concatenate([part[name] for part in rows]) for name in buffer.columns()}
-    columns[LENGTHS] = np.array([len(episode) for episode in group], np.int64)
+    columns[LENGTHS] = np.array(lengths, np.int64)
     return safetensors.numpy.save(columns)
 
 
