@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError, DependencyNotInstalled, ResetNeeded
 
 #: in ``info``: why this step did not happen. What it returned is made up.
 FAULT = "env_fault"
@@ -23,6 +24,10 @@ FORGIVEN_AFTER = 1000
 
 class EnvironmentFaultError(RuntimeError):
     """An environment failed again and again; the message says which, when and how."""
+
+
+#: what no reset mends, since it is not the environment that went wrong; the first is a guard's inside this one
+NO_FAULTS = (EnvironmentFaultError, ClosedEnvironmentError, ResetNeeded, DependencyNotInstalled)
 
 
 class FaultCounter:
@@ -74,7 +79,8 @@ class FaultGuard(gymnasium.Wrapper):
     """Goes on where an environment raises (dm_control's ``PhysicsError`` or any other error) or gives NaN or infinity.
 
     The step is reported as truncated, with the last good observation and no reward, and ``info["env_fault"]`` tells why;
-    the caller resets as after any other episode. A reset that fails is tried again.
+    the caller resets as after any other episode. A reset that fails is tried again. Not so a closed environment, a step
+    before the first reset, and a package that is missing: these errors come through.
 
     :param env: the environment
     :param max_faults: in a row that are too many: with neither a whole episode nor 1000 good steps between them
@@ -86,17 +92,19 @@ class FaultGuard(gymnasium.Wrapper):
         super().__init__(env)
         self.faults = FaultCounter(str(env) if name is None else name, max_faults)
         self._last: Any = None
+        self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """:raises EnvironmentFaultError: after ``max_faults`` failures in a row"""
+        """
+        :raises EnvironmentFaultError: after ``max_faults`` failures in a row
+        :raises gymnasium.error.ClosedEnvironmentError: if it fails and was closed
+        """
         while True:
             try:
                 observation, info = self.env.reset(seed=seed, options=options)
                 reason = what_is_not_finite(observation, 0.0)
-            except EnvironmentFaultError:
-                raise  # of a guard inside this one
             except Exception as error:
-                reason = describe(error)
+                reason = self._fault(error)
             if reason is None:
                 self._last = observation
                 return observation, info
@@ -107,15 +115,14 @@ class FaultGuard(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """:raises ValueError: for an action that is not finite: that is the agent's fault
         :raises EnvironmentFaultError: after ``max_faults`` failures in a row
+        :raises gymnasium.error.ClosedEnvironmentError: if it fails and was closed
         """
         check_finite_action(action, self.faults.name, self.faults.steps + 1)
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
             reason = what_is_not_finite(observation, reward)
-        except EnvironmentFaultError:
-            raise
         except Exception as error:
-            reason = describe(error)
+            reason = self._fault(error)
         if reason is not None:
             text = self.faults.bad(reason)
             return self._last, 0.0, False, True, {FAULT: text, FAULTS: self.faults.take()}
@@ -124,6 +131,30 @@ class FaultGuard(gymnasium.Wrapper):
         if new := self.faults.take():
             info = {**info, FAULTS: new}
         return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Close it; some environments can be used again."""
+        self._closed = True
+        super().close()
+
+    def _fault(self, error: Exception) -> str:
+        """What went wrong, in words.
+
+        :raises Exception: if it is no fault of the environment
+        """
+        if isinstance(error, NO_FAULTS):
+            raise error
+        if self._closed:
+            raise closed(self.faults.name) from error
+        return describe(error)
+
+
+def closed(name: str) -> ClosedEnvironmentError:
+    """The error of whoever is used after ``close()``.
+
+    :param name: of the environment
+    """
+    return ClosedEnvironmentError(f"{name} was closed: make a new one.")
 
 
 def describe(error: BaseException) -> str:

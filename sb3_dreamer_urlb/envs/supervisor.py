@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 from stable_baselines3.common.vec_env.util import dict_to_obs, obs_space_info
 
-from sb3_dreamer_urlb.envs.faults import FAULT, FAULTS, EnvironmentFaultError, FaultCounter, check_finite_action
+from sb3_dreamer_urlb.envs.faults import FAULT, FAULTS, EnvironmentFaultError, FaultCounter, check_finite_action, closed
 from sb3_dreamer_urlb.envs.worker import Worker, WorkerFault, end_all, start_context
 
 #: seconds that close() gives workers before it ends them by force
@@ -88,13 +88,22 @@ class SupervisedVecEnv(VecEnv):
     # -- stepping ------------------------------------------------------------------------------------------------------
 
     def step_async(self, actions: np.ndarray) -> None:
-        """:raises ValueError: for an action that is not finite"""
+        """
+        :raises ValueError: for an action that is not finite
+        :raises gymnasium.error.ClosedEnvironmentError: after ``close()``
+        """
+        self._check_open()
         for counter, action in zip(self.counters, actions, strict=True):
             check_finite_action(action, counter.name, counter.steps + 1)
         for i, action in enumerate(actions):
             if i not in self._lost:
                 self._send_or_lose(i, "step", action)
         self.waiting = True
+
+    def _check_open(self) -> None:
+        """Or each process would be replaced, as one that died."""
+        if self.closed:
+            raise closed(type(self).__name__)
 
     def _send_or_lose(self, i: int, command: str, data: Any) -> None:
         try:
@@ -104,6 +113,7 @@ class SupervisedVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """:raises EnvironmentFaultError: after ``max_faults`` faults of one environment in a row"""
+        self._check_open()
         self.waiting = False
         results = [self._result(i) for i in range(self.num_envs)]
         observations, rewards, dones, infos, self.reset_infos = map(list, zip(*results, strict=True))
@@ -159,6 +169,7 @@ class SupervisedVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """:raises EnvironmentFaultError: after ``max_faults`` faults of one environment in a row"""
+        self._check_open()
         self.waiting = False
         self._lost.clear()
         results = []
@@ -195,6 +206,7 @@ class SupervisedVecEnv(VecEnv):
 
         Its episode ends with the next step.
         """
+        self._check_open()
         answers = []
         for i in self._get_indices(indices):
             try:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fake_envs import CounterEnv, counter
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError, DependencyNotInstalled, ResetNeeded
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -221,3 +222,69 @@ def test_the_walker_survives_a_physics_error():
     observation, _ = env.reset()
     assert observation.shape == (16, 16, 3) and FAULT not in env.step(env.action_space.sample())[4]
     env.close()
+
+
+# -- what is no fault ------------------------------------------------------------------------------------------------------
+
+
+class Freed(CounterEnv):
+    """Cannot be used after ``close()``, and does not say why."""
+
+    freed = False
+
+    def close(self):
+        self.freed = True
+
+    def reset(self, **kwargs):
+        assert not self.freed
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        assert not self.freed
+        return super().step(action)
+
+
+class SaysSo(Freed):
+    def reset(self, **kwargs):
+        if self.freed:
+            raise ClosedEnvironmentError("this one was closed")
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        if self.freed:
+            raise ClosedEnvironmentError("this one was closed")
+        return super().step(action)
+
+
+@pytest.mark.parametrize(("kind", "closes", "message"), [
+    (Freed, lambda env: env.close(), "Freed.*was closed: make a new one"),
+    (SaysSo, lambda env: env.close(), "this one was closed"),
+    (SaysSo, lambda env: env.unwrapped.close(), "this one was closed"),
+])  # fmt: skip
+@pytest.mark.filterwarnings("error")
+def test_a_closed_environment_ends_at_once(kind, closes, message):
+    env = FaultGuard(FaultGuard(kind()))
+    env.reset()
+    env.step(ACTION)
+    closes(env)
+    for use in (lambda: env.step(ACTION), env.reset):
+        with pytest.raises(ClosedEnvironmentError, match=message):
+            use()
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_may_be_used_after_close_may_be():
+    env = FaultGuard(CounterEnv())
+    env.close()
+    env.reset()
+    env.step(ACTION)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("error", [ResetNeeded("reset first"), DependencyNotInstalled("no pygame")])
+def test_mistakes_of_the_caller_are_no_faults(error):
+    env = FaultGuard(Faulty(bad_steps={1: error}, bad_resets={2: error}))
+    env.reset()
+    for use in (lambda: env.step(ACTION), env.reset):
+        with pytest.raises(type(error), match=str(error)):
+            use()

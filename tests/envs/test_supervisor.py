@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fake_envs import CounterEnv, counter
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError
 from places import PYTHONPATH
 from stable_baselines3.common.monitor import Monitor
 
@@ -252,3 +253,15 @@ def test_a_process_ends_although_its_worker_is_stopped():
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, timeout=200, check=True)
     with pytest.raises(ProcessLookupError):
         os.kill(int(done.stdout), 0)
+
+
+def test_after_close_no_process_is_started():
+    env = make()
+    env.reset()
+    env.close()
+    before = [worker.process.pid for worker in env.workers]
+    for use in (env.reset, lambda: env.step(np.zeros((2, 2))), lambda: env.get_attr("t"), lambda: env.env_method("pid")):
+        with pytest.raises(ClosedEnvironmentError, match="SupervisedVecEnv was closed: make a new one"):
+            use()
+    assert [worker.process.pid for worker in env.workers] == before and env.counters[0].in_a_row == 0
+    env.close()
