@@ -207,7 +207,9 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
                 f"state must be what the last predict() of this policy returned, arrays of the shapes "
                 f"{[(n, *shape) for shape in expected]}, got {found}."
             )
-        return self._memory_of([th.as_tensor(part, device=self.device) for part in state])
+        # Copies only what torch does not take, as arrays that nobody may write to.
+        parts = [part if isinstance(part, th.Tensor) else np.require(part, requirements="W") for part in state]
+        return self._memory_of([th.as_tensor(part, device=self.device) for part in parts])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = batch_size(observation)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -32,6 +33,9 @@ def checked_observation(observation: Any, space: spaces.Space[Any]) -> Observati
 
 def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
     shape: tuple[int, ...] = space.shape or ()
+    if isinstance(value, th.Tensor):
+        value = value.detach().cpu()
+        value = value.float() if value.dtype == th.bfloat16 else value  # numpy has none
     try:
         array = np.asarray(value)
         numbers = array.dtype.kind in "biuf"

@@ -352,3 +352,24 @@ def test_standalone_policy():
     chosen, state = policy.predict(np.zeros((40, 40, 3), np.uint8))
     assert action.contains(chosen) and state[0].shape == (1, 8)
     assert DreamerV2.policy_aliases["CnnPolicy"] is DreamerPolicy
+
+
+@pytest.mark.filterwarnings("error")
+def test_tensors_and_arrays_that_nobody_may_write_to(tiny_model):
+    env = CounterEnv(observation_space=spaces.Box(-1, 1, (3,), np.float32))
+    model = tiny_model(env, "MlpPolicy")
+    seen = np.random.default_rng(0).normal(size=(2, 3)).astype(np.float16).astype(np.float32)
+    expected, state = model.predict(seen, deterministic=True)
+    given = [
+        th.tensor(seen),
+        th.tensor(seen, requires_grad=True),
+        th.tensor(seen).double(),
+        seen.tolist(),
+        list(map(th.tensor, seen)),
+    ]
+    for one in given:
+        assert np.array_equal(model.predict(one, deterministic=True)[0], expected)
+    assert model.predict(th.tensor(seen).bfloat16(), deterministic=True)[0].shape == expected.shape
+    for part in (seen, *state):
+        part.setflags(write=False)
+    model.predict(seen, state=state)
