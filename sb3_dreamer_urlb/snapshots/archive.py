@@ -119,11 +119,11 @@ def writing(target: Target, kind: str, suffix: str = "zip") -> Iterator[Writer]:
             yield writer
     elif hasattr(target, "write") and not isinstance(target, io.TextIOBase):
         # A zip goes back to its members' beginnings: streams that append, compress or send cannot.
-        with tempfile.SpooledTemporaryFile(SPOOLED) as file:
-            with Writer(file, kind) as writer:  # type: ignore[arg-type]
+        with tempfile.SpooledTemporaryFile(SPOOLED) as spooled:
+            with Writer(spooled, kind) as writer:  # type: ignore[arg-type]
                 yield writer
-            file.seek(0)
-            while block := file.read(BLOCK):
+            spooled.seek(0)
+            while block := spooled.read(BLOCK):
                 _write_all(target, block)
     else:
         raise TypeError(f"Expected a path or a binary file object to save to, got {_shown(target)}.")

@@ -34,8 +34,8 @@ def save(buffer: SequenceReplayBuffer, target: Target) -> None:
     :param buffer: open episodes are stored, too
     :param target: path (``.zip`` is added where it has no suffix), or binary file object
     """
-    finished, open_ = list(buffer.episodes), dict(enumerate(buffer.open))
-    open_ = {i: episode for i, episode in open_.items() if episode is not None}
+    finished = list(buffer.episodes)
+    open_ = {i: episode for i, episode in enumerate(list(buffer.open)) if episode is not None}
     write(buffer, target, [*finished, *open_.values()], list(open_))
 
 
