@@ -61,11 +61,16 @@ class CollectingAlgorithm(SavingAlgorithm):
 
         :param actions: as chosen
         :param action_noise: added to them
-        :raises ValueError: if one is not finite
+        :raises ValueError: if one is not finite, or the noise is for other actions
         """
         n = len(actions)
         if action_noise is not None:
-            actions = np.clip(actions + action_noise().reshape(n, -1), -1, 1)
+            noise = np.asarray(action_noise())
+            if noise.size not in (n, actions.size):
+                raise ValueError(
+                    f"action_noise gives {noise.size} numbers, for {n} environment(s) with {actions[0].size} actions each."
+                )
+            actions = np.clip(actions + noise.reshape(n, -1), -1, 1)
         check_finite_action(actions, "The policy", self.num_timesteps)
         self.phase_timesteps += n
         self.phase_frames += n * self.action_repeat

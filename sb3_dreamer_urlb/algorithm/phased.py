@@ -57,6 +57,9 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     :param kwargs: of SB3's ``OffPolicyAlgorithm``
     """
 
+    #: whether :meth:`set_env` is at work, which assigns
+    _sets_env = False
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -166,6 +169,13 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         self._check_env(wrapped)
         return wrapped
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """As ever; another environment that is assigned is set, as by :meth:`set_env`."""
+        if name == "env" and "policy" in vars(self) and not (self._sets_env or value is None or value is self.env):
+            self.set_env(value)
+        else:
+            super().__setattr__(name, value)
+
     def _check_env(self, env: VecEnv) -> None:
         checks.check_env(self, env)
 
@@ -177,7 +187,11 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         :raises ValueError: if it does not fit; the model stays as it is
         """
         wrapped, known = self.prepare_env(env), self._known_statistics()
-        super().set_env(wrapped, force_reset)
+        self._sets_env = True
+        try:
+            super().set_env(wrapped, force_reset)
+        finally:
+            self._sets_env = False
         if left_environments.found(wrapped) is None:
             # What was seen last, was seen elsewhere, or through other wrappers.
             self._last_obs = None

@@ -11,6 +11,7 @@ import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2, FineTuneCallback, PhaseSwitchCallback, SnapshotError
@@ -356,3 +357,34 @@ def test_the_device_is_not_assigned(algorithm, policy, replay, method, tmp_path)
     with pytest.raises(AttributeError, match="stats_window_size=100"):
         model.stats_window_size = 7
     model.save(tmp_path / "m")
+
+
+@each
+def test_an_assigned_environment_is_set(algorithm, policy, replay, method):
+    space = spaces.Box(-1, 1, (3,), np.float32)
+
+    def other():
+        return CounterEnv(9, observation_space=space)
+
+    model = algorithm("MlpPolicy", other(), preset="tiny", seed=0, device="cpu").learn(20)
+    for env in (other(), DummyVecEnv([other]), VecNormalize(DummyVecEnv([other]), norm_obs=False)):
+        model.env = env
+        assert model._last_obs is None and model.env.num_envs == 1
+        assert model.get_vec_normalize_env() is (env if isinstance(env, VecNormalize) else None)
+        before = model.env
+        model.learn(4, reset_num_timesteps=False)
+        for wrong in (DummyVecEnv([other] * 2), CounterEnv(9)):
+            with pytest.raises((AssertionError, ValueError)):
+                model.env = wrong
+            assert model.env is before
+
+
+@each
+@pytest.mark.parametrize(("size", "fits"), [(2, True), (1, True), (3, False)])
+def test_noise_is_for_these_actions(algorithm, policy, replay, method, size, fits):
+    model = make(algorithm, action_noise=NormalActionNoise(np.zeros(size), np.ones(size)), learning_starts=0)
+    if fits:
+        model.learn(3)
+        return
+    with pytest.raises(ValueError, match=r"action_noise gives 3 numbers, for 1 environment\(s\) with 2 actions each"):
+        model.learn(3)
