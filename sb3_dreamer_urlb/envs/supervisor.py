@@ -77,7 +77,10 @@ class SupervisedVecEnv(VecEnv):
         except Exception as error:
             self.close()
             if isinstance(error, WorkerFault):
-                raise EnvironmentFaultError(f"An environment cannot be made: {error}.") from None
+                raise EnvironmentFaultError(
+                    f"An environment cannot be made: {error}. A script makes such environments below "
+                    "if __name__ == \"__main__\": only, since each process imports it."
+                ) from None
             raise
         super().__init__(len(env_fns), *answers[0])
 

@@ -176,6 +176,32 @@ def test_cartpole(monkeypatch):
     assert model.num_timesteps == 200 and model._n_updates > 0 and model.discount_head
 
 
+def test_memory_of_a_recurrent_agent(small_world):
+    [block] = code_blocks("docs/concepts.md")
+    assert run(block, {})["state"] is not None
+
+
+def test_evaluations_on_the_way(small_world, tmp_path):
+    [block] = code_blocks("docs/evaluation.md")
+    model = run(block.replace('planner="both"', 'planner="both", n_eval_episodes=1'), {})["model"]
+    assert model.phase == "finetuning"
+    assert (tmp_path / "rows.csv").exists() and (tmp_path / "logs" / "evaluations.npz").exists()
+
+
+def test_rewards_that_are_learnt_while_exploring(monkeypatch):
+    for name in PRESETS:
+        monkeypatch.setitem(PRESETS, name, PRESETS["tiny"])
+    names = {}
+    for block in code_blocks("docs/analysis.md"):
+        names = run(block.replace("1_000_000", "20").replace("50_000", "20"), names)
+        assert names["model"].phase == "finetuning"
+
+
+def test_perturbed_tasks():
+    [block] = code_blocks("docs/tasks.md")
+    assert isinstance(run(block, {})["env"], envs.PerturbationWrapper)
+
+
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
 def test_a_howto_opens_with_what_takes_seconds(page):
     """Before anything else: how the whole looks, at the size of tests."""
