@@ -79,7 +79,7 @@ class SupervisedVecEnv(VecEnv):
             if isinstance(error, WorkerFault):
                 raise EnvironmentFaultError(
                     f"An environment cannot be made: {error}. A script makes such environments below "
-                    "if __name__ == \"__main__\": only, since each process imports it."
+                    'if __name__ == "__main__": only, since each process imports it.'
                 ) from None
             raise
         super().__init__(len(env_fns), *answers[0])

@@ -27,7 +27,9 @@ def undefined(code: str) -> set[str]:
     return read - bound
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: str(page.relative_to(ROOT))
+)
 def test_a_page_imports_what_it_uses(page):
     missing = {}
     blocks = code_blocks(page)
