@@ -16,7 +16,6 @@ from sb3_dreamer_urlb.hub.algorithms import SharedAlgorithm, algorithm_of
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
-from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.version import __version__, how_to_install
 
@@ -266,7 +265,7 @@ def who_registers(env_id: str) -> tuple[list[str], bool]:
 
 def changed_arguments(model: AgentAlgorithm) -> dict[str, Any]:
     """Constructor arguments that are not the defaults, as JSON."""
-    signature = named_parameters(type(model))
+    signature = type(model).argument_parameters()
     kind = type(model.policy)
     aliases = [alias for alias, known in model.policy_aliases.items() if known is kind]
     found: dict[str, Any] = {"policy": (aliases or [kind.__name__])[0]}

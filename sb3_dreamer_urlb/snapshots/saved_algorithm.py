@@ -86,8 +86,15 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     @classmethod
     def argument_names(cls) -> list[str]:
         """The constructor arguments that files hold: its own, and those that it decides for the class that it extends."""
-        concrete = itertools.takewhile(lambda kind: not inspect.isabstract(kind), cls.__mro__)
-        return [name for name in dict.fromkeys(itertools.chain(*map(named_parameters, concrete))) if name not in NOT_STORED]
+        return [name for name in cls.argument_parameters() if name not in NOT_STORED]
+
+    @classmethod
+    def argument_parameters(cls) -> dict[str, inspect.Parameter]:
+        """All constructor arguments by name, its own first, through constructors that do not hand them on, too."""
+        found: dict[str, inspect.Parameter] = {}
+        for kind in itertools.takewhile(lambda kind: not inspect.isabstract(kind), cls.__mro__):
+            found = {**named_parameters(kind), **found}
+        return found
 
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments, as the model has them now; without those that a subclass keeps nowhere."""

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from sb3_dreamer_urlb import DreamerV2, DrQv2, SequenceReplayBuffer
 from sb3_dreamer_urlb.dreamer_v2.policies import MlpPolicy
 from sb3_dreamer_urlb.drq_v2.policies import MlpPolicy as DrQMlpPolicy
+from sb3_dreamer_urlb.hub.model_card import changed_arguments
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
 
 SPACE = spaces.Box(-1, 1, (3,), np.float32)
@@ -101,6 +102,7 @@ def test_what_a_constructor_decides_can_be_changed_when_loading(algorithm, polic
     with pytest.warns(UserWarning, match=r"Fixed has no attribute 'rate'.*To keep it: self\.rate = rate"):
         model = through_a_file(Fixed(make_env(), 1e-2), batch_size=7, policy_kwargs={}, seed=4)
     assert (model.learning_rate, model.batch_size, model.seed, model.device.type) == (1e-2, 7, 4, "cpu")
+    assert changed_arguments(model)["batch_size"] == 7  # of its card on the Hub
 
 
 @each
