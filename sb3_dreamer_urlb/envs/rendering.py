@@ -15,6 +15,8 @@ import sys
 import warnings
 from typing import Any
 
+from sb3_dreamer_urlb.before_opengl import load_triton
+
 _INSTALL_HINT = (
     "Install EGL (`apt-get install libegl1 libopengl0 libgl1-mesa-dri`) or OSMesa (`apt-get install libosmesa6`); "
     "no display and no GPU are needed."
@@ -64,6 +66,8 @@ def load_renderer() -> str:
     render = sys.modules.get("dm_control._render")
     postponed = render is not None and render.Renderer is _draw_on_demand
     already_imported = render is not None and not postponed
+    if not already_imported:
+        load_triton()
     if not already_imported and sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
         os.environ["MUJOCO_GL"] = _choose_backend()
     try:

@@ -8,6 +8,11 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_dreamer_urlb.before_opengl import load_triton
+
+# Not only when the first optimiser is made: a user's environment may draw before.
+load_triton()
+
 
 class ClippedAdam:
     """Adam with a global gradient-norm bound and a weight decay that does not scale with the learning rate.
