@@ -250,7 +250,8 @@ class DreamerPolicy(AgentPolicy[ActingState]):
             assert self.planner is not None
             with precisions.products(self.device, self.planner_dtype):
                 model = planned(self.agent, skill)
-                action, plan = self.planner.plan(model, state.latent, plan, generator, explore=not deterministic)
+                chosen = self.planner.plan(model, state.latent, plan, generator, explore=not deterministic)
+                action, plan = self.planner.returned("plan", chosen, state.action.shape, plan.shape)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mode if deterministic else policy.sample(generator)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch as th
 
@@ -59,3 +59,25 @@ class Planner(ABC):
         :param explore: add the planner's noise to the action
         :return: action in [-1, 1], float (n, A), and the mean to hand in at the next step, float (n, H, A)
         """
+
+    def returned(self, method: str, given: Any, *shapes: Sequence[int | None]) -> Any:
+        """What a method gave, which a subclass may have written, if it has the right form.
+
+        :param method: its name
+        :param given: what it returned
+        :param shapes: of the tensors that it must return; None stands for one number, the same in all of them
+        :raises ValueError: for anything else, naming class, method and both forms
+        """
+        found = given if isinstance(given, tuple) else (given,)
+        if all(isinstance(one, th.Tensor) for one in found) and len(found) == len(shapes):
+            pairs = [
+                pair
+                for one, shape in zip(found, shapes, strict=True)
+                for pair in zip((len(one.shape), *one.shape), (len(shape), *shape), strict=False)
+            ]
+            free = {size for size, wanted in pairs if wanted is None}
+            if len(free) <= 1 and all(wanted in (None, size) for size, wanted in pairs):
+                return given
+        wanted_form = ", ".join(str(tuple(shape)).replace("None", "k") for shape in shapes)
+        form = ", ".join(str(tuple(one.shape)) if isinstance(one, th.Tensor) else type(one).__name__ for one in found)
+        raise ValueError(f"{type(self).__qualname__}.{method} must return {wanted_form}, got {form}.")

@@ -41,10 +41,12 @@ class CategoricalDynaMPC(DynaMPC):
         for _ in range(self.config.iterations):
             samples = self._draw(probs.unsqueeze(1).expand(-1, self.config.n_samples, -1, -1), generator)
             actions = th.cat([samples, proposals], 1)
-            value = self.evaluate(model, trajectories, actions, generator)
-            elites, weight = self.elites(actions, value)
+            value = self.returned("evaluate", self.evaluate(model, trajectories, actions, generator), actions.shape[:2])
+            n, _, *sequence = actions.shape
+            elites, weight = self.returned("elites", self.elites(actions, value), (n, None, *sequence), (n, None))
             # The elites' mean is how often each class is chosen.
-            probs = self._mixed(self.refine(probs, elites, weight)[0])
+            mean, _ = self.returned("refine", self.refine(probs, elites, weight), probs.shape, probs.shape)
+            probs = self._mixed(mean)
         if explore:
             return self._draw(probs[:, 0], generator), probs
         return self._draw_elite(elites, weight, generator), probs

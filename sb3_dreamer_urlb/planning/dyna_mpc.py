@@ -38,9 +38,10 @@ class DynaMPC(Planner):
         for j in range(self.config.iterations):
             samples = (mean.unsqueeze(1) + std.unsqueeze(1) * noise[j]).clamp(-1, 1)
             actions = th.cat([samples, proposals], 1)
-            value = self.evaluate(model, trajectories, actions, generator)
-            elites, weight = self.elites(actions, value)
-            mean, std = self.refine(mean, elites, weight)
+            value = self.returned("evaluate", self.evaluate(model, trajectories, actions, generator), actions.shape[:2])
+            n, _, *sequence = actions.shape
+            elites, weight = self.returned("elites", self.elites(actions, value), (n, None, *sequence), (n, None))
+            mean, std = self.returned("refine", self.refine(mean, elites, weight), mean.shape, mean.shape)
         action = self._draw_elite(elites, weight, generator)
         if explore:
             action = action + std[:, 0] * self._exploration_noise(action, generator)

@@ -176,3 +176,32 @@ def test_it_sees_the_agent_and_its_memory_is_its_plan(tiny_model):
     model = tiny_model(planner=Still, learning_starts=0, planner_delay=0)
     action, _ = model.predict(np.zeros((1, 16, 16, 3), np.uint8))
     assert np.allclose(action, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "said"),
+    [
+        ("evaluate", lambda value: value[:, 0], r"\(1, 10\), got \(1,\)"),
+        ("evaluate", lambda value: value.unsqueeze(-1), r"\(1, 10\), got \(1, 10, 1\)"),
+        ("evaluate", lambda value: value.tolist(), r"\(1, 10\), got list"),
+        ("elites", lambda pair: (pair[0], pair[1][:, :2]), r"\(1, k, 3, 6\), \(1, k\), got \(1, 4, 3, 6\), \(1, 2\)"),
+        ("elites", lambda pair: pair[0], r"\(1, k, 3, 6\), \(1, k\), got \(1, 4, 3, 6\)"),
+        ("refine", lambda pair: pair[0], r"\(1, 3, 6\), \(1, 3, 6\), got \(1, 3, 6\)"),
+        ("plan", lambda pair: (pair[0][:, :3], pair[1]), r"\(1, 6\), \(1, 3, 6\), got \(1, 3\), \(1, 3, 6\)"),
+        ("plan", lambda pair: pair[0], r"\(1, 6\), \(1, 3, 6\), got \(1, 6\)"),
+    ],
+)
+def test_what_a_method_returns_has_the_right_form(method, wrong, said, monkeypatch):
+    right = getattr(DynaMPC, method)
+    monkeypatch.setattr(Own, method, lambda self, *args, **kwargs: wrong(right(self, *args, **kwargs)))
+    env = CounterEnv(20, action_space=spaces.Box(-1, 1, (6,), np.float32))
+    model = DreamerV2("CnnPolicy", env, preset="tiny", planner=instance(), learning_starts=0, planner_delay=0, device="cpu")
+    with pytest.raises(ValueError, match=rf"^Own\.{method} must return {said}\.$"):
+        model.predict(env.reset()[0], deterministic=True)
+
+
+def test_another_number_of_elites_is_right(monkeypatch):
+    monkeypatch.setattr(Own, "elites", lambda self, *args: tuple(part[:, :2] for part in DynaMPC.elites(self, *args)))
+    env = CounterEnv(20, action_space=spaces.Box(-1, 1, (6,), np.float32))
+    model = DreamerV2("CnnPolicy", env, preset="tiny", planner=instance(), learning_starts=0, planner_delay=0, device="cpu")
+    assert model.predict(env.reset()[0], deterministic=True)[0].shape == (6,)
