@@ -4,6 +4,7 @@ Tables' figures come from made-up rows, and say so; the comparison from the epis
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 import tempfile
@@ -66,5 +67,6 @@ def draw_comparison(out: Path) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     draw(ROOT / "docs" / "images" / "evaluation")
     draw_comparison(ROOT / "docs" / "images" / "evaluation")

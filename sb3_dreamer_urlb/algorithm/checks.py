@@ -65,8 +65,10 @@ def check_given_env(env: Any) -> None:
 
     :param env: what was given as environment
     :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
-    :raises ValueError: for environments that Gymnasium vectorised
+    :raises ValueError: for environments that Gymnasium vectorised, and for what is no environment
     """
+    if not hasattr(env, "step"):
+        raise ValueError(f"env must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
     if isinstance(env, gymnasium.vector.VectorEnv):
         raise ValueError(
             f"env is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 does: "

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -154,6 +155,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        env = maybe_make_env(env, 0)  # an id, wherever an environment is taken
         checks.check_given_env(env)
         wrapped = CollectingAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         checks.check_keeps_fractions(wrapped)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import warnings
+import zipfile
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
-from sb3_dreamer_urlb.snapshots.archive import blaming
+from sb3_dreamer_urlb.snapshots.archive import MANIFEST, blaming
 from sb3_dreamer_urlb.snapshots.atomic import path_to_read
 
 
@@ -19,13 +20,15 @@ def convert(old: str | os.PathLike[str], new: str | os.PathLike[str], trust: boo
     :param new: path to write
     :param trust: whoever made ``old`` may run code on this machine
     :return: the converted model
-    :raises ValueError: without ``trust``, or if it is no such file
+    :raises ValueError: without ``trust``, if it is no such file, or in the new form already
     """
+    path = path_to_read(old, "zip")
+    if zipfile.is_zipfile(path) and MANIFEST in zipfile.ZipFile(path).namelist():
+        raise ValueError(f"{path} is in the safe form already.")
     if not trust:
         raise ValueError(
             f"Loading {os.fspath(old)} can run any code that its maker put in. If you trust where it comes from, add --trust."
         )
-    path = path_to_read(old, "zip")
     with warnings.catch_warnings(), blaming(str(path)):
         warnings.simplefilter("ignore")
         # DreamerV2's own load is the safe one.

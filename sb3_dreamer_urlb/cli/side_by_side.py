@@ -45,7 +45,7 @@ class DemoConfig:
 
     :param out: folder that everything is written to
     :param task: of the walker; the pre-training never saw its reward
-    :param finetune_frames: environment frames that each agent learns the task from
+    :param finetune_frames: environment frames that each agent learns the task from, an episode at least
     :param pretrain_frames: of a pre-training before; 0 takes the agent that ships
     :param episodes: evaluation episodes
     :param seed: of everything random
@@ -65,8 +65,10 @@ class DemoConfig:
         self.task = self.task.removeprefix(f"{DOMAIN}-")
         if self.task not in URLB_TASKS[DOMAIN]:
             raise ValueError(f"Unknown task {self.task!r}; known are {', '.join(URLB_TASKS[DOMAIN])}, of the {DOMAIN}.")
-        check_positive(self, "finetune_frames", "episodes")
-        check_integer("pretrain_frames", self.pretrain_frames, 0)
+        check_positive(self, "episodes")
+        check_integer("finetune_frames", self.finetune_frames, EPISODE)
+        if self.pretrain_frames:
+            check_integer("pretrain_frames", self.pretrain_frames, EPISODE)
         if self.preset != PRESET and not self.pretrain_frames:
             raise ValueError(f"The agent that ships has the preset {PRESET!r}: preset={self.preset!r} needs pretrain_frames.")
 

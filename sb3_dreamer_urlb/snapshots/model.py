@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_device, get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -131,7 +130,7 @@ def load(
     if not isinstance(custom_objects, dict | None):
         raise TypeError(f"custom_objects must be a dictionary of arguments by name or None, got {custom_objects!r}.")
     device = get_device(device)
-    wrapped = None if env is None else algorithm._wrap_env(maybe_make_env(env, 0), kwargs.get("verbose", 0))
+    wrapped = None if env is None else algorithm._wrap_env(env, kwargs.get("verbose", 0))
     with reading(source, KIND) as archive:
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")

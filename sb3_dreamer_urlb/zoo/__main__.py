@@ -128,6 +128,8 @@ def _plot(rest: list[str]) -> int:
     from matplotlib import pyplot as plt
     from rl_zoo3.plots import plot_train
 
+    from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line
+
     # Folders of runs have a dash where the id has a slash.
     sys.argv = [
         parser.prog,
@@ -144,7 +146,7 @@ def _plot(rest: list[str]) -> int:
         counts[folder] = len(found)
         return found
 
-    with mock.patch.object(module, "load_results", counting):
+    with told_in_a_line(parser.prog), mock.patch.object(module, "load_results", counting):
         plot_train()
     few = {folder: count for folder, count in counts.items() if count < own.episode_window}
     for folder, count in few.items():

@@ -142,10 +142,11 @@ def test_one_core_takes_one_agent_after_the_other(monkeypatch):
 def test_arguments_reach_the_demo(monkeypatch, tmp_path):
     seen = []
     monkeypatch.setattr(side_by_side, "run_demo", seen.append)
-    arguments = ["--task", "walker-run", "--seed", "3", "--pretrain-frames", "7", "--finetune-frames", "8", "--episodes", "9"]
+    frames = ["--pretrain-frames", "7000", "--finetune-frames", "8000"]
+    arguments = ["--task", "walker-run", "--seed", "3", *frames, "--episodes", "9"]
     assert __main__.main(["demo", "--out", str(tmp_path), *arguments]) == 0
     assert __main__.main(["demo"]) == 0
-    assert seen == [DemoConfig(tmp_path, "run", 8, 7, 9, 3), DemoConfig()]
+    assert seen == [DemoConfig(tmp_path, "run", 8000, 7000, 9, 3), DemoConfig()]
 
 
 @pytest.mark.parametrize(
@@ -153,8 +154,10 @@ def test_arguments_reach_the_demo(monkeypatch, tmp_path):
     [
         (["--task", "fly"], "Unknown task 'fly'; known are stand, walk, run, flip"),
         (["--task", "quadruped-run"], "Unknown task 'quadruped-run'"),
-        (["--finetune-frames", "0"], "finetune_frames must be positive, got 0"),
-        (["--pretrain-frames", "-1"], "pretrain_frames must be an integer of at least 0, got -1"),
+        (["--finetune-frames", "0"], "finetune_frames must be an integer of at least 1000, got 0"),
+        (["--finetune-frames", "999"], "finetune_frames must be an integer of at least 1000, got 999"),
+        (["--pretrain-frames", "10"], "pretrain_frames must be an integer of at least 1000, got 10"),
+        (["--pretrain-frames", "-1"], "pretrain_frames must be an integer of at least 1000, got -1"),
         (["--episodes", "0"], "episodes must be positive, got 0"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import encodings.cp437  # noqa: F401 - of names in zip files; code_events would see its import
 import io
 import json
 import os
@@ -634,6 +635,9 @@ def test_stable_baselines3s_own_form_is_refused_and_converted(old_form, tmp_path
     assert "--trust" in capsys.readouterr().err
     assert main(["convert", str(old), str(new), "--trust"]) == 0
     assert same(load(new), model) and "24 frames" in capsys.readouterr().out
+    for more in ([], ["--trust"]):
+        assert main(["convert", str(new), str(tmp_path / "newer"), *more]) == 2
+    assert capsys.readouterr().err.count(f"{new} is in the safe form already.") == 2
 
 
 def test_converting_what_is_none(saved, tmp_path, capsys):

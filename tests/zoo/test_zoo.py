@@ -580,3 +580,10 @@ def test_films_go_into_the_runs_folder(zoo):
     film = "{'sb3_dreamer_urlb.VideoCallback': dict(video_freq=20, video_length=3)}"
     run = train(zoo, STAND, 40, "scratch", params=["preset:'tiny'", f"callback:[{film}]"])
     assert {path.name for path in (run / "videos").iterdir()} == {"agent_20.gif", "agent_40.gif"}
+
+
+def test_plot_of_runs_that_are_not_there_costs_a_line(zoo, capsys):
+    with pytest.raises(SystemExit) as end:
+        zoo("plot", "-a", "dreamerv2", "-e", STAND, "-f", "logs", "--output", "curve.png")
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and "logs/dreamerv2" in error and error.count("\n") == 1
