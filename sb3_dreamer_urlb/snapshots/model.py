@@ -130,7 +130,7 @@ def load(
     if not isinstance(custom_objects, dict | None):
         raise TypeError(f"custom_objects must be a dictionary of arguments by name or None, got {custom_objects!r}.")
     device = get_device(device)
-    wrapped = None if env is None else algorithm._wrap_env(env, kwargs.get("verbose", 0))
+    wrapped = None if env is None else algorithm._wrap_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type] # ids, too
     with reading(source, KIND) as archive:
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")

@@ -9,7 +9,10 @@ import pytest
 from places import ROOT
 
 PROGRAMS = [
-    path for folder in ("scripts", "benchmarks") for path in sorted((ROOT / folder).glob("*.py")) if "__main__" in path.read_text()
+    path
+    for folder in ("scripts", "benchmarks")
+    for path in sorted((ROOT / folder).glob("*.py"))
+    if "__main__" in path.read_text()
 ]
 
 
