@@ -1,4 +1,4 @@
-"""Environment frames a second, by domain, rendering backend and kind of VecEnv: ``python benchmarks/collect.py``.
+"""Environment frames a second, by domain, rendering backend and kind of VecEnv: python benchmarks/collect.py.
 
 The floor is dm_control alone, without this package, Gymnasium or Stable-Baselines3: one environment, two control steps and
 one picture of 64×64 a loop. Rows are seconds a frame of *all* environments, so two processes that do not wait for each

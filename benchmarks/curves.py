@@ -1,8 +1,8 @@
-"""How cost grows with batch size, imagination horizon, planner samples and environments: ``python benchmarks/curves.py``.
+"""How cost grows with batch size, imagination horizon, planner samples and environments: python benchmarks/curves.py.
 
 Networks of paper size. One thing changes at a time; the points of all curves take turns. The floor of a point is the time
 that its own arithmetic (matrix products and convolutions, as torch counts them) takes as big products in the same format.
-With ``--picture FILE`` the curves are drawn.
+With --picture FILE the curves are drawn.
 """
 
 from __future__ import annotations

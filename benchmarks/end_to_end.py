@@ -1,7 +1,7 @@
-"""A short pre-training and fine-tuning on a real environment, and where their time goes: ``python benchmarks/end_to_end.py``.
+"""A short pre-training and fine-tuning on a real environment, and where their time goes: python benchmarks/end_to_end.py.
 
 Each phase runs in a process of its own, whose peak memory is its own, too; fine-tuning begins from the snapshot that
-pre-training saved. What is timed are windows of one update and the agent steps that belong to it (``train_freq``), planner on
+pre-training saved. What is timed are windows of one update and the agent steps that belong to it (train_freq), planner on
 in fine-tuning. The floor of a window is dm_control alone for as many steps, and the arithmetic of update and plans as big
 matrix products: the authors' at paper size (2.4 TFLOP and 195 GFLOP), at other sizes what torch counts of ours.
 

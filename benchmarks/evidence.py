@@ -6,10 +6,10 @@
     python benchmarks/evidence_results.py                # what the finished ones say, with intervals and a figure
 
 An agent explores a body without any reward, the walker or, for a sparse task, the finger; then it learns a task. Beside it
-stand agents that learn that task from scratch. Which runs there are, and how large: ``evidence_study.py``. Everything lies in
-``results/evidence``: ``episodes.csv``, a row for every episode of every finished run; ``rows.csv``, a row for every score
-(actor alone, and with Dyna-MPC); ``snapshots/``, the pre-trained agents, from which further fine-tunings start. Runs that are
-under way keep themselves in ``runs/`` and go on there when they are asked for again; several processes, each with its own run,
+stand agents that learn that task from scratch. Which runs there are, and how large: evidence_study.py. Everything lies in
+results/evidence: episodes.csv, a row for every episode of every finished run; rows.csv, a row for every score
+(actor alone, and with Dyna-MPC); snapshots/, the pre-trained agents, from which further fine-tunings start. Runs that are
+under way keep themselves in runs/ and go on there when they are asked for again; several processes, each with its own run,
 may work beside each other.
 """
 

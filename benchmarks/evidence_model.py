@@ -5,8 +5,8 @@
 Only where it is clearly ahead can fine-tuning profit from the model. The held-out episodes are a fresh actor's; a model sees
 five observations, then follows the actions with its eyes shut. The error is the root mean square over all numbers of the
 state, each in units of its standard deviation in the held-out episodes: 1 is what the mean alone would give. Beside the
-pre-trained agents of ``results/evidence`` stand agents that learn the task from scratch, after some agent steps of it. Rows go
-to ``results/evidence/open_loop.csv``.
+pre-trained agents of results/evidence stand agents that learn the task from scratch, after some agent steps of it. Rows go
+to results/evidence/open_loop.csv.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What the runs of ``evidence.py`` say: a table with intervals, how many seeds a difference needs, and a figure.
+"""What the runs of evidence.py say: a table with intervals, how many seeds a difference needs, and a figure.
 
     python benchmarks/evidence_results.py                    # the table, as Markdown
     python benchmarks/evidence_results.py --figure out.png   # learning curves, too
 
-Interquartile means over seeds with 95 % bootstrap intervals. The episodes of ``results/evidence/episodes.csv`` give the mean
-return over all of fine-tuning (the area under its curve) and over its last quarter; ``rows.csv`` gives the evaluations at its
+Interquartile means over seeds with 95 % bootstrap intervals. The episodes of results/evidence/episodes.csv give the mean
+return over all of fine-tuning (the area under its curve) and over its last quarter; rows.csv gives the evaluations at its
 end, actor alone and with Dyna-MPC.
 """
 

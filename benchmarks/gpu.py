@@ -1,7 +1,7 @@
-"""All rows of a GPU in one table: ``python benchmarks/gpu.py``, under 9 minutes, no network; paper size unless told otherwise.
+"""All rows of a GPU in one table: python benchmarks/gpu.py, under 9 minutes, no network; paper size unless told otherwise.
 
 Updates and planned actions with CUDA graphs against this package's own eager mode, whether both do the same, peak memory of
-pre-training and fine-tuning, and both phases measured whole on a task of the benchmark. ``--device cpu --preset tiny`` runs
+pre-training and fine-tuning, and both phases measured whole on a task of the benchmark. --device cpu --preset tiny runs
 every line of this script; its numbers mean nothing then.
 """
 

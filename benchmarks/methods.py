@@ -1,4 +1,4 @@
-"""What an update costs with each exploration method, relative to LBS: ``python benchmarks/methods.py``."""
+"""What an update costs with each exploration method, relative to LBS: python benchmarks/methods.py."""
 
 from __future__ import annotations
 

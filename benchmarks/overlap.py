@@ -1,7 +1,7 @@
-"""What stepping and rendering during the update saves: ``python benchmarks/overlap.py --preset small --threads 1``.
+"""What stepping and rendering during the update saves: python benchmarks/overlap.py --preset small --threads 1.
 
 One environment in a process of its own; the two loops take turns in one run, so both do the same work. Beside the measured
-ratio stands the one that follows from the parts where each process has a core for itself: with ``--clock cpu``, parts are
+ratio stands the one that follows from the parts where each process has a core for itself: with --clock cpu, parts are
 CPU times, which other programs on the machine change little.
 """
 

@@ -1,4 +1,4 @@
-"""Time and memory of the particles' nearest neighbours, forward and backward: ``python benchmarks/particles.py``.
+"""Time and memory of the particles' nearest neighbours, forward and backward: python benchmarks/particles.py.
 
 Ours, torch.cdist + topk where that fits, and faiss where it is installed (its search alone: it knows no gradients).
 Each is measured in a process of its own, so that none inherits another's memory.

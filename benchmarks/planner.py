@@ -1,4 +1,4 @@
-"""An action against the machine's limit, with and without the planner: ``python benchmarks/planner.py``, paper size.
+"""An action against the machine's limit, with and without the planner: python benchmarks/planner.py, paper size.
 
 The floor of a planned action is the time that the authors' arithmetic, 195 GFLOP, takes as big products, in bfloat16 where the
 machine multiplies that well; that of ten environments is one environment.

@@ -1,7 +1,7 @@
-"""What each form of the planned agent gains, and each switch within it: ``python benchmarks/planner_forms.py``, paper size.
+"""What each form of the planned agent gains, and each switch within it: python benchmarks/planner_forms.py, paper size.
 
-Forms (docstring of ``planning/prepared``) and the same with a thing taken away, in turns; a ratio above one is what it saves.
-Another processor takes a process of its own, with variables of ``tests/helpers/every_combination.py`` before Python starts.
+Forms (docstring of planning/prepared) and the same with a thing taken away, in turns; a ratio above one is what it saves.
+Another processor takes a process of its own, with variables of tests/helpers/every_combination.py before Python starts.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Rates of the replay's stores against plain numpy: ``python benchmarks/replay.py``, batches of 50×50 frames of 64×64×3.
+"""Rates of the replay's stores against plain numpy: python benchmarks/replay.py, batches of 50×50 frames of 64×64×3.
 
-The floor of ``sample`` gathers the same bytes from flat arrays by one fancy index a column; that of ``add`` copies the same
+The floor of sample gathers the same bytes from flat arrays by one fancy index a column; that of add copies the same
 rows into flat arrays, one by one as they come. Stores are measured full, so that every new episode drives an old one out.
 """
 

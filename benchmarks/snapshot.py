@@ -1,4 +1,4 @@
-"""Seconds to save and to load a snapshot: ``python benchmarks/snapshot.py``, all optimisers' moments included.
+"""Seconds to save and to load a snapshot: python benchmarks/snapshot.py, all optimisers' moments included.
 
 The floors write the same bytes to the same disk, fsync included, and read them back. Promised for the paper's sizes: under
 3 s each (docs/reliability.md).

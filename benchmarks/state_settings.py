@@ -5,7 +5,7 @@
 
 Each setting is a preset and changes to it; each run has one seed and learns walk or run for 10 000 agent steps (20
 episodes) without a pre-training. One seed tells settings apart that fail, not those that are alike. Rows lie in
-``results/state_settings.csv``.
+results/state_settings.csv.
 """
 
 from __future__ import annotations

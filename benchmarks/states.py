@@ -5,7 +5,7 @@
 
 Environments: seconds an agent step (two frames), the resets of whole episodes spread over them; the floor is the same task
 from states, the physics alone. Agents: an update, and the actor's choice of an action. Projected is a fine-tuning of 50 000
-agent steps in the walker, S · (step + action) + U · (sample + update), without a planner; ``--steps`` also does one, so long,
+agent steps in the walker, S · (step + action) + U · (sample + update), without a planner; --steps also does one, so long,
 and times it.
 """
 

@@ -1,4 +1,4 @@
-"""An update against the machine's limit: ``python benchmarks/update.py``, paper size unless told otherwise (50×50, H = 15).
+"""An update against the machine's limit: python benchmarks/update.py, paper size unless told otherwise (50×50, H = 15).
 
 The floor is the time that the authors' arithmetic of an update, 2.4 TFLOP, takes as big matrix products in the same
 format, or in float32 where the machine multiplies only that well.

@@ -2,8 +2,8 @@
 
     python benchmarks/vector_tasks.py CartPole-v1 --seeds 0 1 2 --out docs/images
 
-The hyperparameters are those of ``zoo_configs/vectors.yml``. Each seed writes ``<task>_<seed>.csv`` (agent steps, CPU seconds
-and return of every episode); ``<task>.png`` shows all that lie there (matplotlib).
+The hyperparameters are those of zoo_configs/vectors.yml. Each seed writes <task>_<seed>.csv (agent steps, CPU seconds
+and return of every episode); <task>.png shows all that lie there (matplotlib).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dreamer-urlb COMMAND``, or ``python -m sb3_dreamer_urlb COMMAND``; ``--help`` lists the commands."""
+"""The command line: ``sb3-dreamer-urlb COMMAND``, or ``python -m sb3_dreamer_urlb COMMAND``."""
 
 from __future__ import annotations
 
@@ -28,6 +28,9 @@ MODULES = (
     "tasks",
     "zero_shot",
 )
+DESCRIPTION = (
+    "Demonstrations, evaluations, pages and tables of DreamerV2 agents. 'sb3-dreamer-urlb COMMAND --help' tells of each."
+)
 
 
 @ending_with_its_reader()
@@ -37,41 +40,53 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process if None
     :return: exit status
     """
-    parser = argparse.ArgumentParser(prog="sb3-dreamer-urlb", description=__doc__)
+    parser = argparse.ArgumentParser(prog="sb3-dreamer-urlb", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True)
-    pixels = commands.add_parser(
-        "demo-pixels", help="pre-train and fine-tune a small agent on walker pixels, and show the result"
-    )
-    pixels.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_pixels_output)")
-    tour = commands.add_parser("methods", help="pre-train and fine-tune once with every exploration method, and print a table")
-    tour.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
-    tour.add_argument("--methods", nargs="+", help="which (default: all)")
-    tour.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
-    for run in (pixels, tour):
-        run.add_argument("--task", help="for example walker-walk (default: walker-stand)")
-        run.add_argument("--seed", type=int)
-        run.add_argument("--pretrain-frames", type=int)
-        run.add_argument("--finetune-frames", type=int)
-        run.add_argument("--episodes", type=int, help="evaluation episodes")
-        run.add_argument("--preset", help="of the model (default: small)")
-    old = commands.add_parser("convert", help="rewrite a model that Stable-Baselines3 saved with pickles in the safe form")
-    old.add_argument("old", type=Path)
-    old.add_argument("new", type=Path)
-    old.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
     modules = {name.replace("_", "-"): import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
-    for name, module in modules.items():
-        module.add_arguments(commands.add_parser(name, help=module.HELP, description=module.__doc__))
+    for name in sorted({*modules, *OTHERS}):
+        if name in modules:
+            module = modules[name]
+            module.add_arguments(commands.add_parser(name, help=module.HELP, description=module.__doc__))
+        else:
+            text, add_arguments, _ = OTHERS[name]
+            add_arguments(commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}."))
     options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
     command = options.pop("command")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    others = {"demo-pixels": _demo_pixels, "methods": _methods, "convert": _convert}
     # Heavy imports only inside, so that --help answers at once.
-    act = modules[command].run if command in modules else others[command]
+    act = modules[command].run if command in modules else OTHERS[command][2]
     return ending_in_a_line("sb3-dreamer-urlb", lambda: int(act(options)))
+
+
+def _demo_pixels_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_pixels_output)")
+    _small_run_arguments(parser)
+
+
+def _methods_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
+    parser.add_argument("--methods", nargs="+", help="which (default: all)")
+    parser.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
+    _small_run_arguments(parser)
+
+
+def _small_run_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--task", help="for example walker-walk (default: walker-stand)")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument("--pretrain-frames", type=int)
+    parser.add_argument("--finetune-frames", type=int)
+    parser.add_argument("--episodes", type=int, help="evaluation episodes")
+    parser.add_argument("--preset", help="of the model (default: small)")
+
+
+def _convert_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("old", type=Path)
+    parser.add_argument("new", type=Path)
+    parser.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
 
 
 def _demo_pixels(options: dict[str, Any]) -> int:
@@ -94,6 +109,26 @@ def _convert(options: dict[str, Any]) -> int:
     model = convert(**options)
     print(f"Wrote {options['new']}: {model.phase}, {model.phase_frames} frames.")
     return 0
+
+
+#: the other commands: what they do, their arguments, and how they run; their modules are heavy to import
+OTHERS = {
+    "convert": (
+        "rewrite a model that Stable-Baselines3 saved with pickles in the safe form",
+        _convert_arguments,
+        _convert,
+    ),
+    "demo-pixels": (
+        "pre-train and fine-tune a small agent on walker pixels, and show the result",
+        _demo_pixels_arguments,
+        _demo_pixels,
+    ),
+    "methods": (
+        "pre-train and fine-tune once with every exploration method, and print a table",
+        _methods_arguments,
+        _methods,
+    ),
+}
 
 
 if __name__ == "__main__":

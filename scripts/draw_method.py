@@ -1,4 +1,4 @@
-"""Draw the method as a picture: ``python scripts/draw_method.py`` writes docs/images/method.svg, with nothing but Python."""
+"""Draw the method as a picture: python scripts/draw_method.py writes docs/images/method.svg, with nothing but Python."""
 
 from __future__ import annotations
 

@@ -20,4 +20,5 @@ PROGRAMS = [
 def test_it_explains_itself(path, tmp_path):
     done = subprocess.run([sys.executable, path, "--help"], capture_output=True, text=True, cwd=tmp_path, timeout=300)
     assert done.returncode == 0 and "usage:" in done.stdout, done.stderr
+    assert "``" not in done.stdout
     assert not list(tmp_path.iterdir())

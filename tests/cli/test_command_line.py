@@ -1,0 +1,30 @@
+"""What the command line says of itself."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from sb3_dreamer_urlb.__main__ import MODULES, OTHERS, main
+
+COMMANDS = sorted({name.replace("_", "-") for name in MODULES} | set(OTHERS))
+
+
+def helped(capsys, *arguments):
+    with pytest.raises(SystemExit, match=r"^0$"):
+        main([*arguments, "--help"])
+    return capsys.readouterr().out
+
+
+def test_commands_are_listed_in_order_each_with_what_it_does(capsys):
+    listed = re.findall(r"^    ([a-z-]+)(?:  +\S|$)", helped(capsys), re.MULTILINE)
+    assert listed == COMMANDS
+
+
+@pytest.mark.parametrize("command", [(), *[(name,) for name in COMMANDS]], ids=" ".join)
+def test_help_is_plain_text_that_says_what_it_is(command, capsys):
+    text = helped(capsys, *command)
+    head, _, about = text.partition("\n\n")
+    assert head.startswith("usage: sb3-dreamer-urlb") and "`" not in text and not re.search(r":\w+:`", text)
+    assert re.match(r"[A-Z].+\.$", " ".join(about.split("\n\n")[0].split()))
