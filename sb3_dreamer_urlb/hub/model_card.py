@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,8 +18,12 @@ from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.version import __version__, how_to_install
+from sb3_dreamer_urlb.version import __version__, install_in_a_clone
 
+#: folders of absolute paths, and of those in somebody's home: /home/me/ of /home/me/logs
+PRIVATE_FOLDERS = re.compile(r"(?<![\w./\\~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s'\"/\\]+[/\\])+")
+#: a Python that ran a module, with its options
+PYTHON = re.compile(r"^.*?python[\w.]*(?: -[^m\s]\S*)*(?= -m )")
 FROM_SCRATCH = "none, learnt from scratch"
 #: say something about the machine, or have a line of their own
 NOT_LISTED = ("verbose", "tensorboard_log", "stats_window_size", "seed", "intrinsic_reward", "planner")
@@ -98,9 +103,17 @@ def facts_about(model: AgentAlgorithm, env_id: str, command: str | None) -> Mode
         action_repeat=model.action_repeat,
         planner=planner_name(getattr(model, "planner", None)),
         seed=model.seed,
-        command=command,
+        command=None if command is None else without_private_paths(command),
         algorithm=algorithm_of(model).name,
     )
+
+
+def without_private_paths(text: str) -> str:
+    """For everybody to read: ``/home/me/.venv/bin/python -m`` is ``python -m``, of other absolute paths the last part stays.
+
+    :param text: a command, or a value of an argument
+    """
+    return PRIVATE_FOLDERS.sub("", PYTHON.sub("python", text))
 
 
 def metadata(algorithm: SharedAlgorithm, facts: ModelFacts, evaluation: Evaluation) -> str:
@@ -184,7 +197,7 @@ def model_card(
 
 ## Use it
 
-sb3_dreamer_urlb {__version__} or later; {how_to_install("hub").replace("pip", "`pip")}`.
+sb3_dreamer_urlb {__version__} or later; in a clone of the repository: `{install_in_a_clone("hub")}`.
 {"Then, in this folder:" if repo_name == "./" else "Then:"}
 
 ```python
@@ -276,8 +289,16 @@ def changed_arguments(model: AgentAlgorithm) -> dict[str, Any]:
             value = value.frequency if value.unit.value == "step" else (value.frequency, value.unit.value)
         # None, {} and what the preset filled in compare by what they are now.
         if value != signature[name].default and not (value == {} and signature[name].default is None):
-            found[name] = values.encode_or_describe(value)
+            found[name] = _for_everybody(values.encode_or_describe(value))
     return found
+
+
+def _for_everybody(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _for_everybody(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_for_everybody(part) for part in value]
+    return without_private_paths(value) if isinstance(value, str) else value
 
 
 def config(facts: ModelFacts, model_file: str) -> dict[str, Any]:

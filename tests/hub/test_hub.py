@@ -29,7 +29,7 @@ import sb3_dreamer_urlb
 from sb3_dreamer_urlb import DreamerV2, DrQv2, SnapshotError
 from sb3_dreamer_urlb.hub import load_from_hub, load_vec_normalize, package_to_hub, push_to_hub, save_vec_normalize
 from sb3_dreamer_urlb.hub import package as packaging
-from sb3_dreamer_urlb.hub.model_card import who_registers
+from sb3_dreamer_urlb.hub.model_card import who_registers, without_private_paths
 from sb3_dreamer_urlb.hub.repositories import FolderRepository, HubRepository, check_filename, open_repository
 
 ID, VECTORS = "test/Counter-v0", "test/Vectors-v0"
@@ -487,3 +487,34 @@ def test_the_card_imports_who_registers_the_environment():
         del gymnasium.registry["Fake/Own-v0"]
     assert who_registers("urlb/walker-run-v0") == who_registers("Pendulum-v1") == ([], True)
     assert who_registers("nowhere-v0") == ([], False)
+
+
+MODULE = "-m sb3_dreamer_urlb.zoo train --env urlb/walker-run-v0"
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        (f"/home/me/.venv/bin/python {MODULE}", f"python {MODULE}"),
+        (f"/home/my name/.venv/bin/python3.11 -u {MODULE}", f"python {MODULE}"),
+        (f"C:\\Users\\me\\python.exe {MODULE}", f"python {MODULE}"),
+        (f"python {MODULE}", f"python {MODULE}"),
+        ("/home/me/bin/python /home/me/train.py --seed 1", "python train.py --seed 1"),
+        ("sb3-dreamer-urlb x -m y", None),
+        ("python train.py -f=/home/me/logs -i ~/runs/a.zip", "python train.py -f=logs -i a.zip"),
+        ("python train.py -params snapshot:'/home/me/a.zip'", "python train.py -params snapshot:'a.zip'"),
+        ("python train.py -f ./logs -i ../a/b.zip --url https://a.org/b/c", None),
+    ],
+)
+def test_a_command_tells_nothing_of_the_machine(said, shown):
+    assert without_private_paths(said) == (shown or said)
+
+
+def test_a_card_tells_nothing_of_the_machine(tiny_model, tmp_path):
+    replay = {"store": "lmdb", "path": str(tmp_path / "replay"), "map_size": 1 << 22}
+    model = tiny_model(gymnasium.make("test/Counter-v0"), replay_buffer_kwargs=replay)
+    package_to_hub(model, tmp_path / "hub", n_eval_episodes=1, command=f"{tmp_path}/bin/python {MODULE}", video_length=0)
+    for name in ("README.md", "config.json"):
+        text = (tmp_path / "hub" / name).read_text()
+        assert str(tmp_path) not in text and f"python {MODULE}" in text
+    assert '"path": "replay"' in (tmp_path / "hub" / "README.md").read_text()
