@@ -146,7 +146,7 @@ def fitted(config: DemoConfig, env: gymnasium.Env, limit: float = LIMIT) -> Demo
             f"{chosen.finetune_frames} frames in place of {config.pretrain_frames} and {config.finetune_frames}, evaluated in "
             f"{chosen.episodes} episode(s) in place of {config.episodes}. Give the numbers yourself for the whole."
         )
-    print(f"The demonstration will take {pace.in_words(seconds(share))}.", flush=True)
+    print(f"Learning and playing will take {pace.in_words(seconds(share))}; pictures come on top.", flush=True)
     return chosen
 
 

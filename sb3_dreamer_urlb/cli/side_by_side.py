@@ -148,12 +148,15 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
         )
 
     def seconds(share: float) -> float:
-        steps = config.episodes * EPISODE // model.action_repeat
-        # Evaluations play all their episodes at once; one action for ten costs about as much as for three.
-        played = pace.Amount(2 * steps, 0, 0).seconds(its_pace) + 0.4 * steps * its_pace.plan
+        episode = EPISODE // model.action_repeat
+        steps = config.episodes * episode
+        # Evaluations play all their episodes at once; one planned action for ten costs about as much as for three or four.
+        played = pace.Amount(2 * steps + demo_agents.FILM_STEPS, 0, 0).seconds(its_pace)
+        played += max(0.4 * config.episodes, 1.0) * episode * its_pace.plan
         learning = pace.phase(model, at(share).finetune_frames, False).seconds(its_pace)
         before = pace.phase(model, config.pretrain_frames, False).seconds(its_pace)
-        return before + (learning + played) * 2 / _at_once()
+        random = steps * its_pace.step
+        return before + (learning + played) * 2 / _at_once() + random
 
     share = pace.shrink(seconds, limit, LEAST)
     chosen = at(share)
@@ -163,7 +166,10 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
             f"All of it would take {pace.in_words(seconds(1.0))}: on this machine {chosen.finetune_frames} frames in place of "
             f"{config.finetune_frames}. Give --finetune-frames yourself for the whole."
         )
-    print(f"The demonstration will take {pace.in_words(seconds(share))}.", flush=True)
+    print(
+        f"Learning and playing will take {pace.in_words(seconds(share))}; starting the agents and drawing come on top.",
+        flush=True,
+    )
     return chosen
 
 

@@ -129,6 +129,15 @@ def test_a_slow_machine_takes_fewer_frames_and_says_so(monkeypatch, capsys):
     assert fitted(monkeypatch, 100.0, finetune_frames=30_000).finetune_frames == 30_000
 
 
+@pytest.mark.parametrize(("episodes", "words"), [(1, "about 8 minutes"), (10, "about 33 minutes")])
+def test_evaluations_count_and_what_does_not_is_named(monkeypatch, capsys, episodes, words):
+    """An action a step is planned at least, however few episodes are played at once."""
+    monkeypatch.setattr(pace, "measure", lambda *_: Pace(0.0, 1.0, 0.0, 0.0))
+    monkeypatch.setattr(side_by_side, "_at_once", lambda: 2)
+    side_by_side.fitted(DemoConfig(finetune_frames=1000, episodes=episodes))
+    assert f"Learning and playing will take {words}; starting" in capsys.readouterr().out
+
+
 def test_one_core_takes_one_agent_after_the_other(monkeypatch):
     monkeypatch.setattr(side_by_side.os, "sched_getaffinity", lambda _: {0}, raising=False)
     assert side_by_side._at_once() == 1
