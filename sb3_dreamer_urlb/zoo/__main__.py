@@ -7,6 +7,7 @@ import functools
 import os
 import runpy
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         import rl_zoo3.utils
 
         from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line, with_values_named
+        from sb3_dreamer_urlb.zoo.playing import Played
         from sb3_dreamer_urlb.zoo.registration import register
         from sb3_dreamer_urlb.zoo.resuming import with_runs
     except ModuleNotFoundError as error:
@@ -66,13 +68,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("No display: playing without a window (--no-render); record_video makes a film.")
         rest = [*rest, "--no-render"]
     sys.argv = [f"{parser.prog} {command}", *rest]
+    played = Played()
     parse_args = with_runs(with_values_named(argparse.ArgumentParser.parse_args))
     with (
         told_in_a_line(sys.argv[0]),
         mock.patch.object(argparse.ArgumentParser, "parse_args", parse_args),
         mock.patch("rl_zoo3.utils.get_model_path", _that_says_what_there_is(rl_zoo3.utils.get_model_path, sys.argv[0])),
+        mock.patch("rl_zoo3.create_test_env", played.counting(rl_zoo3.create_test_env)),
     ):
         runpy.run_module(f"rl_zoo3.{command}", run_name="__main__")
+    if command == "enjoy" and (complaint := played.complaint()):
+        print(f"{sys.argv[0]}: {complaint}", file=sys.stderr)
     return 0
 
 
@@ -99,14 +105,19 @@ def _that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callabl
         try:
             return original(exp_id, folder, algo, *args, **kwargs)
         except (AssertionError, ValueError) as error:
-            runs = sorted(path.name for path in Path(folder, algo).glob("*") if path.is_dir())
-            there = (
-                f"runs in {Path(folder, algo)}: {', '.join(runs)}" if runs else f"no run in {Path(folder, algo)} (-f names it)"
-            )
-            print(f"{prog}: {str(error).rstrip('.')}; {there}", file=sys.stderr)
+            print(f"{prog}: {str(error).rstrip('.')}; {_what_there_is(folder, algo)}", file=sys.stderr)
             raise SystemExit(2) from error
 
     return get_model_path
+
+
+def _runs(folder: str, algo: str) -> list[str]:
+    return sorted(path.name for path in Path(folder, algo).glob("*") if path.is_dir())
+
+
+def _what_there_is(folder: str, algo: str) -> str:
+    path, runs = Path(folder, algo), _runs(folder, algo)
+    return f"runs in {path}: {', '.join(runs)}" if runs else f"no run in {path} (-f names it)"
 
 
 def _plot(rest: list[str]) -> int:
@@ -118,23 +129,30 @@ def _plot(rest: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m sb3_dreamer_urlb.zoo plot", add_help=False)
     parser.add_argument("--output")
     parser.add_argument("-w", "--episode-window", type=int, default=100)
+    parser.add_argument("-a", "--algo")
+    parser.add_argument("-e", "--env", nargs="+")
+    parser.add_argument("-f", "--exp-folder")
     own, rest = parser.parse_known_args(rest)
     rest = [*rest, "--episode-window", str(own.episode_window)]
+    # Folders of runs have a dash where the id has a slash.
+    envs = [env.replace("/", "-") for env in own.env or ()]
+    for option, given in (("--algo", own.algo), ("--exp-folder", own.exp_folder), ("--env", envs)):
+        if given:
+            rest += [option, *([given] if isinstance(given, str) else given)]
     if own.output or not _has_display():
         os.environ["MPLBACKEND"] = "Agg"
     if not own.output and not _has_display() and not {"-h", "--help"} & set(rest):
         parser.error("no display to show the curves on: write them into a file with --output")
+
+    if own.algo and envs and own.exp_folder and not {"-h", "--help"} & set(rest):
+        _check_there_are_runs(envs, own.exp_folder, own.algo, parser.prog)
 
     from matplotlib import pyplot as plt
     from rl_zoo3.plots import plot_train
 
     from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line
 
-    # Folders of runs have a dash where the id has a slash.
-    sys.argv = [
-        parser.prog,
-        *(argument.replace("/", "-") if argument.startswith(("urlb/", "rwrl/")) else argument for argument in rest),
-    ]
+    sys.argv = [parser.prog, *rest]
     if own.output:
         plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
     counts: dict[str, int] = {}
@@ -146,7 +164,8 @@ def _plot(rest: list[str]) -> int:
         counts[folder] = len(found)
         return found
 
-    with told_in_a_line(parser.prog), mock.patch.object(module, "load_results", counting):
+    with told_in_a_line(parser.prog), mock.patch.object(module, "load_results", counting), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "No artists with labels")  # told below, run by run
         plot_train()
     few = {folder: count for folder, count in counts.items() if count < own.episode_window}
     for folder, count in few.items():
@@ -158,6 +177,18 @@ def _plot(rest: list[str]) -> int:
     if not counts:
         print(f"{parser.prog}: no run with finished episodes was found", file=sys.stderr)
     return 2 if len(few) == len(counts) else 0
+
+
+def _check_there_are_runs(envs: list[str], folder: str, algo: str, prog: str) -> None:
+    """
+    :raises SystemExit: 2, if there is a run of none of the environments; one that has none beside others is named
+    """
+    runs = _runs(folder, algo)
+    missing = [env for env in envs if not any(env in run for run in runs)]
+    if missing:
+        print(f"{prog}: there is no run of {', '.join(missing)}; {_what_there_is(folder, algo)}", file=sys.stderr)
+    if len(missing) == len(envs):
+        raise SystemExit(2)
 
 
 if __name__ == "__main__":

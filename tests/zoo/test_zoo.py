@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ from zoo_commands import CHEAP, CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, m
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
+from sb3_dreamer_urlb.hub.model_card import without_private_paths
 from sb3_dreamer_urlb.zoo import configs, pretraining, registration
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
@@ -352,7 +354,8 @@ def raising(error):
 def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     assert main(["train"]) == 2
-    assert "pip install '.[zoo]'" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "pip install '.[zoo]'" in error and "pip install 'sb3_dreamer_urlb[zoo]'" in error
 
 
 def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
@@ -494,7 +497,8 @@ def test_a_run_is_shared_and_played_elsewhere(zoo, capsys):
         "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip",
     }  # fmt: skip
     card = (repository / "README.md").read_text()
-    assert (run / STAND.replace("/", "-") / "command.txt").read_text().strip() in card
+    command = (run / STAND.replace("/", "-") / "command.txt").read_text().strip()
+    assert without_private_paths(command) in card and sys.executable not in card
     assert "| frames | 80 of pre-training, then 40 on the task" in card and "10.00 +/- 0.00" in card
     assert yaml.safe_load((repository / "args.yml").read_text())["seed"] == 1
     with zipfile.ZipFile(repository / "train_eval_metrics.zip") as metrics:
@@ -582,8 +586,38 @@ def test_films_go_into_the_runs_folder(zoo):
     assert {path.name for path in (run / "videos").iterdir()} == {"agent_20.gif", "agent_40.gif"}
 
 
-def test_plot_of_runs_that_are_not_there_costs_a_line(zoo, capsys):
-    with pytest.raises(SystemExit) as end:
+@pytest.mark.parametrize("there", ["no folder", "runs of another task"])
+def test_plot_of_runs_that_are_not_there_costs_a_line(zoo, capsys, there):
+    if there != "no folder":
+        Path("logs/dreamerv2/urlb-walker-run-v0_3").mkdir(parents=True)
+    with warnings.catch_warnings(), pytest.raises(SystemExit, match=r"^2$"):
+        warnings.simplefilter("error")
         zoo("plot", "-a", "dreamerv2", "-e", STAND, "-f", "logs", "--output", "curve.png")
-    error = capsys.readouterr().err
-    assert end.value.code == 2 and "logs/dreamerv2" in error and error.count("\n") == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert "no run of urlb-walker-stand-v0; " in line
+    assert line.endswith("no run in logs/dreamerv2 (-f names it)" if there == "no folder" else ": urlb-walker-run-v0_3")
+
+
+def test_plot_draws_what_there_is_and_names_what_is_not(zoo, capsys, monkeypatch):
+    from matplotlib import pyplot as plt
+
+    folder = Path("logs/dreamerv2/my-Own-v0_1")
+    folder.mkdir(parents=True)
+    (folder / "0.monitor.csv").write_text('#{"t_start": 0.0, "env_id": "x"}\nr,l,t\n1.0,20,1\n2.0,20,2\n')
+    monkeypatch.setattr(plt, "show", plt.show)
+    zoo("plot", "-a", "dreamerv2", "-e", STAND, "my/Own-v0", "-f", "logs", "-w", "1", "--output", "curve.png")
+    [line] = capsys.readouterr().err.splitlines()
+    assert "no run of urlb-walker-stand-v0; " in line and Path("curve.png").exists()
+    plt.close("all")
+
+
+def test_enjoy_says_when_no_episode_was_finished(zoo, capsys):
+    train(zoo, STAND, 20, "scratch", params=["preset:'tiny'"])
+    play = ["enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "logs", "--no-render", "--device", "cpu", "-n"]
+    capsys.readouterr()
+    zoo(*play, "9")
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "episode" in line]
+    assert line.startswith("python -m sb3_dreamer_urlb.zoo enjoy: no episode was finished in 9 steps")
+    zoo(*play, "25")
+    printed = capsys.readouterr()
+    assert "1 Episodes" in printed.out and "no episode" not in printed.err
