@@ -107,6 +107,11 @@ def test_errors_are_one_line_and_status_two(fake_walker, tmp_path, capsys, argum
     assert error.startswith("sb3-dreamer-urlb: ") and re.search(message, error) and error.count("\n") == 1
 
 
+def test_less_than_an_episode_is_enough(fake_walker, tmp_path, capsys):
+    run_demo(DemoConfig(tmp_path, "walker-walk", 10, 10, episodes=1, preset="tiny"))
+    assert (tmp_path / "report.html").exists() and "mean return of 1 episodes" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--finetune-frames", "-5000"]])
 @pytest.mark.filterwarnings("ignore")
 def test_numbers_that_make_no_sense_are_refused_at_once(fake_walker, tmp_path, monkeypatch, arguments):
