@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.hub.repositories import MISSING_HUB
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
-from sb3_dreamer_urlb.version import __version__, install_in_a_clone
+from sb3_dreamer_urlb.version import __version__, how_to_install
 
 #: folders of absolute paths, and of those in somebody's home: /home/me/ of /home/me/logs
 PRIVATE_FOLDERS = re.compile(r"(?<![\w./\\~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s'\"/\\]+[/\\])+")
@@ -197,7 +197,7 @@ def model_card(
 
 ## Use it
 
-sb3_dreamer_urlb {__version__} or later; in a clone of the repository: `{install_in_a_clone("hub")}`.
+sb3_dreamer_urlb {__version__} or later; {how_to_install("hub").replace("pip", "`pip")}`.
 {"Then, in this folder:" if repo_name == "./" else "Then:"}
 
 ```python

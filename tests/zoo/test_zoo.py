@@ -355,7 +355,7 @@ def test_without_the_extra_the_command_says_what_to_install(monkeypatch, capsys)
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     assert main(["train"]) == 2
     error = capsys.readouterr().err
-    assert "pip install '.[zoo]'" in error and "pip install 'sb3_dreamer_urlb[zoo]'" in error
+    assert "pip install '.[zoo]'" in error
 
 
 def test_enjoy_and_plot_without_a_display(zoo, capsys, monkeypatch):
