@@ -41,9 +41,7 @@ class CategoricalDynaMPC(DynaMPC):
         for _ in range(self.config.iterations):
             samples = self._draw(probs.unsqueeze(1).expand(-1, self.config.n_samples, -1, -1), generator)
             actions = th.cat([samples, proposals], 1)
-            value = self.returned("evaluate", self.evaluate(model, trajectories, actions, generator), actions.shape[:2])
-            n, _, *sequence = actions.shape
-            elites, weight = self.returned("elites", self.elites(actions, value), (n, None, *sequence), (n, None))
+            elites, weight = self._ranked(model, trajectories, actions, generator)
             # The elites' mean is how often each class is chosen.
             mean, _ = self.returned("refine", self.refine(probs, elites, weight), probs.shape, probs.shape)
             probs = self._mixed(mean)

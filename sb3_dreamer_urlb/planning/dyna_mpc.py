@@ -38,9 +38,7 @@ class DynaMPC(Planner):
         for j in range(self.config.iterations):
             samples = (mean.unsqueeze(1) + std.unsqueeze(1) * noise[j]).clamp(-1, 1)
             actions = th.cat([samples, proposals], 1)
-            value = self.returned("evaluate", self.evaluate(model, trajectories, actions, generator), actions.shape[:2])
-            n, _, *sequence = actions.shape
-            elites, weight = self.returned("elites", self.elites(actions, value), (n, None, *sequence), (n, None))
+            elites, weight = self._ranked(model, trajectories, actions, generator)
             mean, std = self.returned("refine", self.refine(mean, elites, weight), mean.shape, mean.shape)
         action = self._draw_elite(elites, weight, generator)
         if explore:
@@ -48,6 +46,15 @@ class DynaMPC(Planner):
         return action.clamp(-1, 1), mean
 
     # -- what a trajectory is worth ----------------------------------------------------------------------------------------
+
+    def _ranked(
+        self, model: PlannableModel, state: LatentState, actions: th.Tensor, generator: th.Generator | None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """The elites among the trajectories and their weights, by :meth:`evaluate` and :meth:`elites`."""
+        value = self.returned("evaluate", self.evaluate(model, state, actions, generator), actions.shape[:2])
+        n, _, *sequence = actions.shape
+        elites, weight = self.returned("elites", self.elites(actions, value), (n, None, *sequence), (n, None))
+        return elites, weight
 
     def evaluate(
         self, model: PlannableModel, state: LatentState, actions: th.Tensor, generator: th.Generator | None
