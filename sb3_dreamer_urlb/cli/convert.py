@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import warnings
-import zipfile
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
-from sb3_dreamer_urlb.snapshots.archive import MANIFEST, blaming
+from sb3_dreamer_urlb.snapshots.archive import blaming, kind_of
 from sb3_dreamer_urlb.snapshots.atomic import path_to_read
 
 
@@ -23,7 +22,7 @@ def convert(old: str | os.PathLike[str], new: str | os.PathLike[str], trust: boo
     :raises ValueError: without ``trust``, if it is no such file, or in the new form already
     """
     path = path_to_read(old, "zip")
-    if zipfile.is_zipfile(path) and MANIFEST in zipfile.ZipFile(path).namelist():
+    if kind_of(path) is not None:
         raise ValueError(f"{path} is in the safe form already.")
     if not trust:
         raise ValueError(

@@ -140,13 +140,22 @@ def _shown(value: Any) -> str:
     return f"{type(value).__name__} {str(value)[:80]!r}"
 
 
-def _check_no_other_kind(path: Path, kind: str) -> None:
+def kind_of(path: Path) -> str | None:
+    """What a safe file says that it holds; None for any other file. Nothing else of it is read or checked.
+
+    :param path: of the file
+    """
     try:
         with zipfile.ZipFile(path) as file:
             there = bounded_json.parse(file.read(MANIFEST)).get("kind")
     except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile):
-        return
-    if there in ("model", "policy", "replay") and there != kind:
+        return None
+    return there if there in ("model", "policy", "replay") else None
+
+
+def _check_no_other_kind(path: Path, kind: str) -> None:
+    there = kind_of(path)
+    if there not in (None, kind):
         raise FileExistsError(17, f"A {kind} does not take the place of a {there}: choose another name", str(path))
 
 
