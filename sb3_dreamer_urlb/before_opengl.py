@@ -7,13 +7,11 @@ their own, that import is a segmentation fault, on machines without a GPU, too. 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from contextlib import suppress
 
 
 def load_triton() -> None:
     """Import Triton where it is installed; half a second, once. Without it, and where it is broken, nothing happens."""
-    if importlib.util.find_spec("triton") is not None:
-        # Whoever needs it hears what is wrong with it from torch.
-        with suppress(Exception):
-            importlib.import_module("triton")
+    # Whoever needs it hears what is wrong with it from torch.
+    with suppress(Exception):
+        importlib.import_module("triton")

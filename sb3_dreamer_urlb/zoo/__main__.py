@@ -141,10 +141,11 @@ def _plot(rest: list[str]) -> int:
             rest += [option, *([given] if isinstance(given, str) else given)]
     if own.output or not _has_display():
         os.environ["MPLBACKEND"] = "Agg"
-    if not own.output and not _has_display() and not {"-h", "--help"} & set(rest):
+    asks_for_help = bool({"-h", "--help"} & set(rest))
+    if not own.output and not _has_display() and not asks_for_help:
         parser.error("no display to show the curves on: write them into a file with --output")
 
-    if own.algo and envs and own.exp_folder and not {"-h", "--help"} & set(rest):
+    if own.algo and envs and own.exp_folder and not asks_for_help:
         _check_there_are_runs(envs, own.exp_folder, own.algo, parser.prog)
 
     from matplotlib import pyplot as plt
