@@ -67,8 +67,7 @@ class DemoConfig:
             raise ValueError(f"Unknown task {self.task!r}; known are {', '.join(URLB_TASKS[DOMAIN])}, of the {DOMAIN}.")
         check_positive(self, "episodes")
         check_integer("finetune_frames", self.finetune_frames, EPISODE)
-        if self.pretrain_frames:
-            check_integer("pretrain_frames", self.pretrain_frames, EPISODE)
+        check_integer("pretrain_frames", self.pretrain_frames, EPISODE if self.pretrain_frames else 0)
         if self.preset != PRESET and not self.pretrain_frames:
             raise ValueError(f"The agent that ships has the preset {PRESET!r}: preset={self.preset!r} needs pretrain_frames.")
 
