@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 
 import numpy as np
@@ -10,7 +9,8 @@ import pytest
 from gymnasium import Env, spaces
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import initialize, invariant, precondition, rule
+from learning_machine import LearningMachine
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
@@ -129,7 +129,7 @@ def statistics(normalizer):
     return [(part.mean.tolist(), part.var.tolist(), part.count) for part in parts]
 
 
-class NormalizedStreams(RuleBasedStateMachine):
+class NormalizedStreams(LearningMachine):
     """Random interleavings of all that may touch a model's environments, which live in processes of their own."""
 
     @initialize(
@@ -171,11 +171,6 @@ class NormalizedStreams(RuleBasedStateMachine):
             env.close()
         for folder in getattr(self, "folders", ()):
             folder.cleanup()
-
-    def learn(self, steps, callback=None, **kwargs):
-        before = self.model.num_timesteps
-        self.model.learn(steps, callback=callback, **kwargs)
-        self.learnt += self.model.num_timesteps - (0 if kwargs.get("reset_num_timesteps") else before)
 
     @rule(steps=st.integers(1, 40), anew=st.booleans())
     def learn_on(self, steps, anew):
@@ -228,14 +223,9 @@ class NormalizedStreams(RuleBasedStateMachine):
 
     @rule(same=st.booleans(), force_reset=st.booleans())
     def save_and_load(self, same, force_reset):
-        model, replay = io.BytesIO(), io.BytesIO()
-        self.model.save(model)
-        self.model.save_replay_buffer(replay)
-        model.seek(0), replay.seek(0)
         old = self.model.get_env()
         before = statistics(old)
-        self.model = DreamerV2.load(model, old if same else self.new_env(), device="cpu", force_reset=force_reset)
-        self.model.load_replay_buffer(replay)
+        self.go_through_files(old if same else self.new_env(), force_reset)
         if self.model.num_timesteps > 0:
             assert statistics(self.model.get_env()) == before
 

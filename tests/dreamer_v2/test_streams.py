@@ -12,7 +12,8 @@ from fake_envs import CounterEnv, counter
 from gymnasium import spaces
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from hypothesis.stateful import initialize, invariant, rule
+from learning_machine import LearningMachine
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -88,7 +89,7 @@ def check_streams(model, envs):
     return steps
 
 
-class Streams(RuleBasedStateMachine):
+class Streams(LearningMachine):
     """Random interleavings of all that may touch a model's environments."""
 
     @initialize(
@@ -117,15 +118,6 @@ class Streams(RuleBasedStateMachine):
         self.envs |= {i: TellingEnv(i, **self.kind) for i in numbers}
         env = DummyVecEnv([lambda i=i: Monitor(self.envs[i]) for i in numbers])
         return VecNormalize(env, norm_obs=False) if self.normalized else env
-
-    def learn(self, steps, callback=None, **kwargs):
-        model, before = self.model, self.model.num_timesteps
-        try:
-            model.learn(steps, callback=callback, **kwargs)
-        finally:
-            # learn() may begin counting anew.
-            self.learnt += model.num_timesteps - (0 if kwargs.get("reset_num_timesteps") else before)
-        return model
 
     @rule(steps=st.integers(1, 30), anew=st.booleans())
     def learn_on(self, steps, anew):
@@ -207,13 +199,7 @@ class Streams(RuleBasedStateMachine):
 
     @rule(same=st.booleans(), force_reset=st.booleans())
     def save_and_load(self, same, force_reset):
-        model, replay = io.BytesIO(), io.BytesIO()
-        self.model.save(model)
-        self.model.save_replay_buffer(replay)
-        model.seek(0), replay.seek(0)
-        env = self.model.get_env() if same else self.new_env()
-        self.model = DreamerV2.load(model, env, device="cpu", force_reset=force_reset)
-        self.model.load_replay_buffer(replay)
+        self.go_through_files(self.model.get_env() if same else self.new_env(), force_reset)
 
     @rule()
     def load_replay_alone(self):
