@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
@@ -60,19 +62,23 @@ def check_learn(total_timesteps: Any, log_interval: Any) -> None:
         check_integer("log_interval", log_interval, 1)
 
 
-def check_given_env(env: Any) -> None:
-    """Before Stable-Baselines3 wraps it, and makes arrays for its observations.
+def given_env(env: Any, argument: str = "env") -> GymEnv:
+    """What a user gave as an environment, wherever one is taken: before Stable-Baselines3 wraps it, and makes arrays for its
+    observations.
 
-    :param env: what was given as environment
+    :param env: an environment, vectorised or not, or its id
+    :param argument: what the user calls it, for messages
+    :return: the environment; of an id, one that can be filmed where it knows how
     :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
     :raises ValueError: for environments that Gymnasium vectorised, and for what is no environment
     """
-    if not hasattr(env, "step"):
-        raise ValueError(f"env must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
+    if not isinstance(env, str) and not hasattr(env, "step"):
+        raise ValueError(f"{argument} must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
+    env = maybe_make_env(env, 0)
     if isinstance(env, gymnasium.vector.VectorEnv):
         raise ValueError(
-            f"env is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 does: "
-            "make it with make_vec_env, DummyVecEnv or SubprocVecEnv of stable_baselines3."
+            f"{argument} is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 "
+            "does: make it with make_vec_env, DummyVecEnv or SubprocVecEnv of stable_baselines3."
         )
     space = getattr(env, "observation_space", None)
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
@@ -80,6 +86,7 @@ def check_given_env(env: Any) -> None:
         if isinstance(part, spaces.Space) and not isinstance(part, spaces.Dict | spaces.Tuple) and part.shape is None:
             which = f"The observation {name!r} must be an array" if name else "Observations must be arrays"
             raise UnsupportedSpaceError(f"{which} of numbers, or several by name in a Dict, got {part}.")
+    return env  # type: ignore[no-any-return]
 
 
 def check_keeps_fractions(env: VecEnv) -> None:

@@ -9,7 +9,6 @@ from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -154,17 +153,15 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     # -- environments --------------------------------------------------------------------------------------------------
 
     @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        env = maybe_make_env(env, 0)  # an id, wherever an environment is taken
-        checks.check_given_env(env)
-        wrapped = CollectingAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+    def _wrap_env(env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        wrapped = CollectingAlgorithm._wrap_env(checks.given_env(env), verbose, monitor_wrapper)
         checks.check_keeps_fractions(wrapped)
         return wrapped
 
-    def prepare_env(self, env: GymEnv) -> VecEnv:
+    def prepare_env(self, env: GymEnv | str) -> VecEnv:
         """Wrap an environment as SB3 does, and check that this model can go on in it.
 
-        :param env: vectorised or not
+        :param env: vectorised or not, or its id
         :raises ValueError: if it does not fit
         """
         wrapped = self._wrap_env(env, self.verbose)
@@ -181,10 +178,10 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     def _check_env(self, env: VecEnv) -> None:
         checks.check_env(self, env)
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """As SB3's; also checks what else the model needs of it, and reads the new environment's action repeat.
 
-        :param env: with the model's number of environments and its spaces
+        :param env: with the model's number of environments and its spaces; an id makes one
         :param force_reset: reset it before going on; False does not if it stands where the model left it, wrapped as then
         :raises ValueError: if it does not fit; the model stays as it is
         """
@@ -223,7 +220,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     def fine_tune(
         self,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         keep_actor: bool | None = None,
         keep_critic: bool = False,
         keep_reward: bool = False,
@@ -232,7 +229,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
 
         The usual research flow: load a pre-trained snapshot, call this, ``learn`` the task.
 
-        :param env: the fine-tuning environment; None stays in the same one
+        :param env: the fine-tuning environment or its id; None stays in the same one
         :param keep_actor: None asks :meth:`keeps_actor`
         :param keep_critic: for ablations
         :param keep_reward: for agents that have one: begin with the task's reward head as the pre-training's rewards taught it
@@ -273,10 +270,10 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         """
         return transfer_rule.keeps_actor(self.domain)
 
-    def prepare_fine_tuning_env(self, env: GymEnv) -> VecEnv:
+    def prepare_fine_tuning_env(self, env: GymEnv | str) -> VecEnv:
         """As :meth:`prepare_env`; also checks that the pre-trained model will be shown what it knows.
 
-        :param env: vectorised or not
+        :param env: vectorised or not, or its id
         :raises ValueError: if it does not fit
         """
         wrapped = self.prepare_env(env)

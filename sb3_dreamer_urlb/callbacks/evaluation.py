@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row
 from sb3_dreamer_urlb.evaluation.episodes import (
@@ -43,7 +44,7 @@ class EvaluationCallback(EvalCallback):
     An ``EvalCallback`` of Stable-Baselines3 that counts environment frames of the phase, plays the same seeds each time,
     and leaves the random draws of the training alone. ``RunCheckpointCallback(..., evaluation=this)`` remembers it.
 
-    :param eval_env: to play in, not the training environment; as ``EvalCallback`` takes it
+    :param eval_env: to play in, not the training environment; as ``EvalCallback`` takes it, or its id
     :param every_frames: of the phase
     :param n_eval_episodes: how many, the paper's 10
     :param rows: CSV file, several runs may share it; None writes none
@@ -63,7 +64,7 @@ class EvaluationCallback(EvalCallback):
 
     def __init__(
         self,
-        eval_env: GymEnv,
+        eval_env: GymEnv | str,
         every_frames: int = 10_000,
         n_eval_episodes: int = EPISODES,
         rows: str | os.PathLike[str] | None = None,
@@ -81,11 +82,12 @@ class EvaluationCallback(EvalCallback):
             check_integer(name, value, 1)
         if planner not in (*PLANNERS, BOTH):
             raise ValueError(f"planner must be one of {(*PLANNERS, BOTH)}, got {planner!r}.")
-        if not isinstance(eval_env, VecEnv):
-            one = eval_env if is_wrapped(eval_env, Monitor) else Monitor(eval_env)
-            eval_env = DummyVecEnv([lambda: one])
+        given = given_env(eval_env, "eval_env")
+        if not isinstance(given, VecEnv):
+            one = given if is_wrapped(given, Monitor) else Monitor(given)
+            given = DummyVecEnv([lambda: one])
         super().__init__(
-            eval_env,
+            given,
             n_eval_episodes=n_eval_episodes,
             log_path=None if log_path is None else os.fspath(log_path),
             best_model_save_path=None if best_model_save_path is None else os.fspath(best_model_save_path),

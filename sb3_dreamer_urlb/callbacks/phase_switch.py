@@ -21,7 +21,7 @@ class PhaseSwitchCallback(BaseCallback):
     and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless.
 
     :param pretrain_frames: length of the pre-training in environment frames (agent steps × action repeat)
-    :param env: the fine-tuning environment; None stays in the same one
+    :param env: the fine-tuning environment or its id; None stays in the same one
     :param keep_actor: None decides by the task (paper §3): kept for walker and quadruped, dropped for jaco
     :param keep_critic: for ablations
     :param keep_reward: begin with the task's reward head of the pre-training, see ``fine_tune``
@@ -33,7 +33,7 @@ class PhaseSwitchCallback(BaseCallback):
     def __init__(
         self,
         pretrain_frames: int = 2_000_000,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         keep_actor: bool | None = None,
         keep_critic: bool = False,
         verbose: int = 0,

@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
 from sb3_dreamer_urlb.types import Observation
@@ -59,9 +60,8 @@ def env_to_play_in(model: AgentAlgorithm, env: GymEnv | str | None = None, argum
         if env is None:
             env = _same_again(model, argument)
             origin = f" It lacks the wrappers of the training environment: give {argument}."
-        elif isinstance(env, str):
-            env = gymnasium.make(env, render_mode="rgb_array")
-        monitored = env if is_wrapped(env, Monitor) else Monitor(env)
+        one: Any = given_env(env, argument)
+        monitored = one if is_wrapped(one, Monitor) else Monitor(one)
         vec_env = _normalized_alike(model, DummyVecEnv([lambda: monitored]))
     vec_env = model._wrap_env(vec_env, verbose=0)
     if vec_env.num_envs != 1:

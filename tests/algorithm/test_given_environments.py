@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback
+from sb3_dreamer_urlb.evaluation.recording import env_to_play_in
 
 ENV = "CartPole-v1"
 
@@ -28,7 +29,15 @@ def load(model, env, folder):
     return DreamerV2.load(folder / "model", env=env, device="cpu")
 
 
-DOORS = pytest.mark.parametrize("door", [set_env, fine_tune, load], ids=lambda door: door.__name__)
+def phase_switch(model, env, folder):
+    return model.learn(40, PhaseSwitchCallback(20, env))
+
+
+def construct(model, env, folder):
+    return DreamerV2("MlpPolicy", env, preset="tiny", device="cpu")
+
+
+DOORS = pytest.mark.parametrize("door", [construct, set_env, fine_tune, load, phase_switch], ids=lambda door: door.__name__)
 
 
 @DOORS
@@ -41,3 +50,25 @@ def test_an_id_will_do(door, tmp_path):
 def test_what_is_no_environment(door, tmp_path):
     with pytest.raises(ValueError, match="env must be an environment of Gymnasium, a VecEnv or an id, got 3"):
         door(tiny(), 3, tmp_path)
+
+
+def play(model, env):
+    return env_to_play_in(model, env, "eval_env")
+
+
+def evaluate(model, env):
+    return EvaluationCallback(env).eval_env
+
+
+STAGES = pytest.mark.parametrize("stage", [play, evaluate], ids=lambda stage: stage.__name__)
+
+
+@STAGES
+def test_an_id_to_play_in(stage):
+    assert stage(tiny(), ENV).envs[0].spec.id == ENV
+
+
+@STAGES
+def test_what_is_no_environment_to_play_in(stage):
+    with pytest.raises(ValueError, match="eval_env must be an environment of Gymnasium, a VecEnv or an id, got 3"):
+        stage(tiny(), 3)
