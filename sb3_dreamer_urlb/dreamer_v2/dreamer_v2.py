@@ -65,7 +65,9 @@ class DreamerV2(AgentAlgorithm):
         world model learns
     :param planner: ``"dyna_mpc"``, ``"mppi"``, ``"mppi_zero_shot"``, another registered name, a subclass or an instance of
         :class:`~sb3_dreamer_urlb.planning.Planner`, or None; acts in fine-tuning, also in ``predict``
-    :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`, for a name or a class
+    :param planner_kwargs: fields of :class:`~sb3_dreamer_urlb.PlannerConfig`, for a name or a class. Without a planner they
+        have no effect; they are kept, and in force once there is one: ``load(path, planner="dyna_mpc")`` or
+        ``model.planner = "dyna_mpc"``
     :param planner_delay: agent steps after ``learning_starts`` until the planner takes over from the actor
     :param ent_coef: weight of the actor's entropy; None: the intrinsic reward's own while exploring (DIAYN 0.1), otherwise the
         preset's, otherwise 0 while exploring and 1e-4 on a task

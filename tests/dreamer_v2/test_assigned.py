@@ -87,6 +87,18 @@ def test_what_was_built_is_not_assigned(tiny_model, name):
     assert getattr(model, name) is before
 
 
+@pytest.mark.parametrize("how", ["assigned", "loaded"])
+def test_a_planners_arguments_wait_for_it(tiny_model, tmp_path, how):
+    model = tiny_model(planner_kwargs={"n_samples": 9}).learn(4)
+    if how == "assigned":
+        model.planner = "dyna_mpc"
+        model.learn(4)
+    else:
+        model.save(tmp_path / "m")
+        model = DreamerV2.load(tmp_path / "m", planner="dyna_mpc", device="cpu")
+    assert model.policy.planner.config.n_samples == 9
+
+
 @pytest.mark.parametrize("then", ["learn", "save"])
 def test_what_is_changed_within_a_dictionary_is_assigned(tiny_model, tmp_path, then):
     model = tiny_model(planner="dyna_mpc", replay_buffer_kwargs={"sampling": "rows"})
