@@ -1,12 +1,16 @@
 """Griffe extension: what docstrings of this package use and the API pages would not understand.
 
-SB3's docstrings name other objects by Sphinx's roles, such as ``:meth:`save```, and attributes are described by ``#:``
-comments.
+SB3's docstrings name other objects by Sphinx's roles, such as ``:meth:`save```, attributes are described by ``#:``
+comments, and defaults are constants of modules: a reader is shown ``"auto"``, not ``AUTO``.
 """
 
 from __future__ import annotations
 
+import ast
+import functools
+import json
 import re
+from pathlib import Path
 from typing import Any
 
 import griffe
@@ -17,7 +21,12 @@ ROLE = re.compile(r":(?:class|meth|func|attr|mod|exc|data):`(~?)([\w.]+)`")
 
 
 class Docstrings(griffe.Extension):
-    """Turns roles into links and ``#:`` comments into docstrings, and hides private arguments."""
+    """Turns roles into links, ``#:`` comments into docstrings and names of defaults into values; hides private arguments."""
+
+    def on_module_instance(self, *, mod: griffe.Module, **_: Any) -> None:
+        """What a folder's ``__init__`` says is for those who work on it, and its members' pages are for those who use them."""
+        if mod.is_init_module:
+            mod.docstring = None
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
         """A ``#:`` comment above an attribute describes it."""
@@ -32,6 +41,7 @@ class Docstrings(griffe.Extension):
     def on_package(self, *, pkg: griffe.Module, **_: Any) -> None:
         """Everything is loaded, so that names can be looked up."""
         _link_roles(pkg)
+        _show_values(pkg)
 
 
 def _comment_above(attr: griffe.Attribute) -> str:
@@ -71,3 +81,50 @@ def _path(obj: griffe.Object, name: str) -> str:
             return scope.canonical_path
         scope = scope.parent
     return name
+
+
+def _show_values(obj: griffe.Object) -> None:
+    if isinstance(obj, griffe.Function):
+        for parameter in obj.parameters:
+            if (
+                isinstance(parameter.default, griffe.Expr)
+                and (value := _value(obj.module, str(parameter.default))) is not None
+            ):
+                parameter.default = value
+    for member in obj.members.values():
+        if isinstance(member, griffe.Object):
+            _show_values(member)
+
+
+def _value(module: Any, name: str) -> str | None:
+    """The literal that a module's constant stands for, as Python writes it; None for anything else.
+
+    :param module: that the name is used in
+    :param name: ``AUTO``, or ``arguments.UNIFORM`` of an imported module
+    """
+    first, _, rest = name.partition(".")
+    member = module.members.get(first)
+    if not isinstance(member, griffe.Alias):
+        return None if rest else _constants(module.filepath).get(first)
+    where, _, constant = (f"{member.target_path}.{rest}" if rest else member.target_path).rpartition(".")
+    try:
+        return _value(module.modules_collection[where], constant)
+    except KeyError:  # another package's
+        return None
+
+
+@functools.cache
+def _constants(path: Path) -> dict[str, str]:
+    """What the assignments of a module, ``A = 1`` or ``A, B = BOTH = (1, 2)``, give names to."""
+    found: dict[str, Any] = {}
+    for node in ast.parse(path.read_text()).body:
+        if not isinstance(node, ast.Assign):
+            continue
+        try:
+            value = ast.literal_eval(node.value)
+        except ValueError:
+            continue
+        for target in node.targets:
+            pairs = zip(target.elts, value, strict=True) if isinstance(target, ast.Tuple) else [(target, value)]
+            found |= {name.id: one for name, one in pairs if isinstance(name, ast.Name)}
+    return {name: json.dumps(one) if isinstance(one, str) else repr(one) for name, one in found.items()}

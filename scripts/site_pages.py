@@ -3,7 +3,8 @@
 README.md is the start page, changelog, security notes and the notebook are pages, and a Python file that a page links to
 becomes a page with its code. Links are rewritten to fit; whatever leads nowhere is left to MkDocs, which refuses it.
 
-Pages are also finished here: formulas become MathML, tables lose empty headers, long signatures are folded.
+Pages are also finished here: formulas become MathML, tables lose empty headers, long signatures are folded, short code
+and numbers stay in one line.
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ LINK = re.compile(r"(?<=\]\()(?!https?:|#)([^)#\s]+)")
 FORMULA = re.compile(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', re.DOTALL)
 EMPTY_HEADER = re.compile(r"<thead>\s*<tr>(?:\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
 SIGNATURE = re.compile(r'<div class="doc-signature highlight">.*?</div>', re.DOTALL)
+PREFORMATTED = re.compile(r"(<pre.*?</pre>)", re.DOTALL)
+# Code in the text, of one line and no more letters than a phone has room for.
+SHORT_CODE = re.compile(r"<code>(?=[^<\n]{1,24}</code>)")
+# 1 050 000; between tags, as pictures have numbers in their attributes.
+TEXT = re.compile(r"(?<=>)[^<]+")
+THOUSANDS = re.compile(r"(?<=\d) (?=\d{3}(?!\d))")
 #: what becomes a page with its text, by its ending: the language to colour it by
 CODE = {".py": "python", ".cff": "yaml", "": "docker"}
 #: lines of a signature that are shown without a click
@@ -121,7 +128,14 @@ def on_page_content(content: str, **_: Any) -> str:
     """Finish a page, once Markdown and docstrings have become HTML."""
     content = FORMULA.sub(lambda match: convert(html.unescape(match[1]).strip(), display="block"), content)
     content = EMPTY_HEADER.sub("", content)
-    return SIGNATURE.sub(lambda match: _folded(match[0]), content)
+    content = SIGNATURE.sub(lambda match: _folded(match[0]), content)
+    return "".join(part if PREFORMATTED.match(part) else _unbroken(part) for part in PREFORMATTED.split(content))
+
+
+def _unbroken(content: str) -> str:
+    """Let no line end within short code, or between the digits of a number."""
+    content = TEXT.sub(lambda match: THOUSANDS.sub("\u00a0", match[0]), content)
+    return SHORT_CODE.sub('<code class="short">', content)
 
 
 def _folded(signature: str) -> str:

@@ -85,5 +85,5 @@ class PlannerConfig:
 
     @property
     def actor_trajectories(self) -> int:
-        """P."""
+        """P, how many of the trajectories the actor proposes: ⌊mixture · N⌋."""
         return int(self.mixture * self.n_samples)

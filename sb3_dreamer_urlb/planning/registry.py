@@ -10,7 +10,8 @@ from typing import Any
 from sb3_dreamer_urlb.number_checks import check_dict
 from sb3_dreamer_urlb.planning.base import Planner
 
-#: what the planners of a name settle in the configuration, whatever preset or user say about these fields
+#: by registered name: the fields of the configuration that the name settles, whatever preset or user say about them, such as
+#: ``use_value=False`` of ``"mppi"``; filled by :func:`register_planner`
 PLANNERS: dict[str, dict[str, Any]] = {}
 _KINDS: dict[str, tuple[type[Planner], ...]] = {}
 

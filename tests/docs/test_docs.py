@@ -220,6 +220,13 @@ def test_code_fits_its_column():
                 assert len(line) <= 110, f"{page.name}: {line}"
 
 
+def test_formulas_are_set():
+    """As formulas between $$, which site and GitHub set; z_t in a sentence stays as it is."""
+    for page in (page for page in PAGES if page.suffix == ".md"):
+        text = re.sub(r"```.*?```|\$\$.*?\$\$|`[^`\n]*`|\]\([^)]*\)", "", page.read_text(), flags=re.DOTALL)
+        assert not re.findall(r"(?<![\w/.])[^\W\d_]_(?:\w\b|\{).*", text), page.name
+
+
 def test_pages_for_readers_stay_short():
     for page, lines in (("performance", 150), ("results", 150)):
         assert len((ROOT / "docs" / f"{page}.md").read_text().splitlines()) <= lines
@@ -248,6 +255,7 @@ def test_the_site(tmp_path):
     docstrings_look_as_they_are_meant(tmp_path)
     pages_and_code_come_from_outside_of_docs(tmp_path)
     pages_are_finished(tmp_path)
+    signatures_and_members_are_a_readers(tmp_path)
 
 
 def every_public_name_has_its_place(site):
@@ -278,6 +286,28 @@ def pages_and_code_come_from_outside_of_docs(site):
     assert "PRETRAIN_FRAMES" in notebook and notebook.count('src="data:image/') == 4 and "random actions" in notebook
 
 
+def without_sources(page: str) -> str:
+    """A page without the folded source code."""
+    return re.sub(r"<details class=\"mkdoc.*?</details>", "", page, flags=re.DOTALL)
+
+
+def signatures_and_members_are_a_readers(site):
+    """Defaults are values, not names of constants; what parts of the package ask of each other is not on the pages."""
+    for page in (site / "api").rglob("*.html"):
+        shown = re.sub(r"<[^>]*>", "", without_sources(page.read_text()))
+        assert not re.findall(r"\w+: str = [\w.]*[A-Z_]{3,},", shown), page
+    algorithm = (site / "api/algorithm/index.html").read_text()
+    assert 'id="sb3_dreamer_urlb.DreamerV2.fine_tune"' in algorithm
+    for name in ("adams", "take_over_changes", "go_on_where_left", "prepare_fine_tuning_env"):
+        assert f'id="sb3_dreamer_urlb.DreamerV2.{name}"' not in algorithm
+    for page, text in {
+        "planners": "the fields of the configuration that the name settles",  # an attribute's comment
+        "environments": "Any subset of the suite's perturbations",
+        "intrinsic_rewards": "In imagination there is no observation, so a head learns to predict the surprise",
+    }.items():
+        assert text in (site / f"api/{page}/index.html").read_text(), page
+
+
 def pages_are_finished(site):
     algorithm = (site / "algorithm/index.html").read_text()
     assert algorithm.count("<math") >= 3 and "arithmatex" not in algorithm and "$$" not in algorithm
@@ -286,9 +316,12 @@ def pages_are_finished(site):
     empty = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
     assert not [page for page in site.rglob("*.html") if empty.search(page.read_text())]
     api = (site / "api/algorithm/index.html").read_text()
-    assert '<details class="signature">' in api and "_init_setup_model" not in re.sub(
-        r"<details class=\"mkdoc.*?</details>", "", api, flags=re.S
-    )
+    assert '<details class="signature">' in api and "_init_setup_model" not in without_sources(api)
+    zoo = (site / "zoo/index.html").read_text()
+    assert '<code class="short">-i</code>' in zoo and "1\u00a0050\u00a0000" in zoo
+    assert not [
+        block for block in re.findall(r"<pre.*?</pre>", zoo, re.DOTALL) if "\u00a0" in block or "short" in block.split(">")[1]
+    ]
     start = (site / "index.html").read_text()
     assert start.count("data-md-color-media") >= 3  # a switch between light and dark
     for address in re.findall(r'(?:src|href)="(https?://[^"]+\.(?:js|css|woff2?))"', start + algorithm):
