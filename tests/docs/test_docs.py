@@ -312,6 +312,8 @@ def pages_are_finished(site):
     algorithm = (site / "algorithm/index.html").read_text()
     assert algorithm.count("<math") >= 3 and "arithmatex" not in algorithm and "$$" not in algorithm
     for page in site.rglob("*.html"):
+        formulas = re.findall(r"<math.*?</math>", page.read_text(), re.DOTALL)
+        assert not [one for one in formulas if "\\" in one], f"{page}: a command of TeX that was not understood"
         assert not re.search(r"<th[^>]*>\s*</th>\s*</tr>\s*</thead>\s*<tbody>\s*</tbody>", page.read_text()), page
     empty = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*>\s*</th>)+\s*</tr>\s*</thead>")
     assert not [page for page in site.rglob("*.html") if empty.search(page.read_text())]
