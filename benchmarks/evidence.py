@@ -111,7 +111,7 @@ def begin(run: Run, folder: Path) -> DreamerV2:
         model.fine_tune(keep_actor=keep_actor)
         model.num_timesteps = 0
         return model
-    kwargs: dict[str, Any] = {"preset": setting.preset, "seed": run.seed, "device": setting.device}
+    kwargs: dict[str, Any] = {"preset": setting.preset, "seed": run.seed, "device": setting.device, **setting.further}
     return DreamerV2(setting.policy, env, intrinsic_reward=method, **kwargs)
 
 
