@@ -18,6 +18,7 @@ from sb3_dreamer_urlb import phases, transfer_rule
 from sb3_dreamer_urlb.algorithm import checks, left_environments, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
+from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.envs.normalized import watch_ends
@@ -73,6 +74,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         **kwargs: Any,
     ):
         checks.check_verbose(verbose)
+        kwargs["device"] = chosen_device(kwargs.get("device", "auto"))
         for name in ("policy_kwargs", "replay_buffer_kwargs"):
             # Stable-Baselines3 takes whatever is false for an empty one.
             check_dict(name, kwargs.get(name))

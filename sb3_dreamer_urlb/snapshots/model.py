@@ -11,9 +11,10 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces, get_device, get_system_info
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
 from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
@@ -129,7 +130,7 @@ def load(
     """
     if not isinstance(custom_objects, dict | None):
         raise TypeError(f"custom_objects must be a dictionary of arguments by name or None, got {custom_objects!r}.")
-    device = get_device(device)
+    device = chosen_device(device)
     wrapped = None if env is None else algorithm._wrap_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type] # ids, too
     with reading(source, KIND) as archive:
         if print_system_info:

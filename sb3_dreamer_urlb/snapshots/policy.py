@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import get_device
 
+from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
@@ -58,7 +58,7 @@ def load(
     :param others: classes whose policy it may be, if it is none of ``kind``
     :raises SnapshotError: naming the file and why it is refused
     """
-    device = get_device(device)
+    device = chosen_device(device)
     with reading(source, KIND) as archive:
         if set(archive.data) != {"parameters"}:
             raise ValueError("it has other fields than it should")
