@@ -169,6 +169,8 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
         f"Learning and playing will take {pace.in_words(seconds(share))}; starting the agents and drawing come on top.",
         flush=True,
     )
+    if not pace.phase(model, chosen.finetune_frames, False).updates:
+        print(f"So few frames hold no update: agents learn from frame {model.learning_starts * model.action_repeat} on.", flush=True)
     return chosen
 
 

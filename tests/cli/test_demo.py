@@ -198,3 +198,9 @@ def test_films_stand_beside_each_other(tmp_path):
         assert picture.n_frames in (1, 3) and picture.width == 96
         pixels = np.asarray(picture.convert("L"))
     assert abs(int(pixels[-1, 5]) - 20) < 8 and abs(int(pixels[-1, 90]) - 200) < 8
+
+
+@pytest.mark.parametrize(("frames", "told"), [(1000, True), (2000, True), (3000, False)])
+def test_frames_that_hold_no_update(monkeypatch, capsys, frames, told):
+    fitted(monkeypatch, 0.1, finetune_frames=frames)
+    assert ("hold no update: agents learn from frame 2000 on" in capsys.readouterr().out) == told
