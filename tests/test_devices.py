@@ -6,9 +6,9 @@ import warnings
 
 import pytest
 import torch as th
+from helpers.fake_envs import CounterEnv
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2
-from helpers.fake_envs import CounterEnv
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DreamerV2, DrQv2])
 

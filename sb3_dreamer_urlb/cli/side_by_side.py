@@ -170,7 +170,10 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
         flush=True,
     )
     if not pace.phase(model, chosen.finetune_frames, False).updates:
-        print(f"So few frames hold no update: agents learn from frame {model.learning_starts * model.action_repeat} on.", flush=True)
+        print(
+            f"So few frames hold no update: agents learn from frame {model.learning_starts * model.action_repeat} on.",
+            flush=True,
+        )
     return chosen
 
 
