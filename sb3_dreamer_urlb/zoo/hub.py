@@ -17,6 +17,7 @@ from typing import Any
 
 import yaml
 
+from sb3_dreamer_urlb.hub.model_card import without_private_paths
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
@@ -207,12 +208,12 @@ def _zoo_files(run: Path, saved: dict[str, Any], env_kwargs: dict[str, Any], fol
 
 
 def _plain(value: Any) -> Any:
-    """As YAML's own types; anything else as its text."""
+    """As YAML's own types, anything else as its text; without names of this machine's folders."""
     if isinstance(value, dict):
         return {str(key): _plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(part) for part in value]
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+    return value if value is None or isinstance(value, bool | int | float) else without_private_paths(str(value))
 
 
 def _read_yaml(path: str) -> dict[str, Any]:

@@ -488,6 +488,19 @@ NORMALISED = f"""
 """
 
 
+def test_what_is_shared_names_no_folder_of_this_machine(tmp_path):
+    here = {"directory": "/home/me/replays/walker", "many": [Path("/data/me/x"), "urlb/walker-run-v0", 3]}
+    for name in ("config.yml", "args.yml"):
+        (tmp_path / name).write_text(yaml.dump({"replay_buffer_kwargs": here, "env_kwargs": here, "seed": 1}))
+    out = tmp_path / "out"
+    out.mkdir()
+    files = zoo_hub._zoo_files(tmp_path, zoo_hub._saved_arguments(tmp_path), here, out)
+    plain = {"directory": "walker", "many": ["x", "urlb/walker-run-v0", 3]}
+    assert yaml.safe_load(files["config.yml"].read_text())["replay_buffer_kwargs"] == plain
+    assert yaml.safe_load(files["args.yml"].read_text()) == {"env_kwargs": plain, "seed": 1}
+    assert yaml.safe_load(files["env_kwargs.yml"].read_text()) == plain
+
+
 def test_a_run_is_shared_and_played_elsewhere(zoo, capsys):
     run = train(zoo, STAND, 60, "lbs", "--eval-freq", "30", "--eval-episodes", "1", params=TINY)
     zoo("push_to_hub", *SHARE, "-f", "logs", "-n", "6", "--n-eval-episodes", "2", "--device", "cpu")
