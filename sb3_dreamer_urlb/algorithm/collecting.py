@@ -22,7 +22,8 @@ from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.algorithm.training_loop import LearningVecEnv
 from sb3_dreamer_urlb.envs import env_steps
 from sb3_dreamer_urlb.envs.faults import check_finite_action
-from sb3_dreamer_urlb.envs.normalized import TERMINAL, RewardsOnly, hides_originals, original_end, original_observations
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL
+from sb3_dreamer_urlb.envs.normalized import RewardsOnly, hides_originals, original_end, original_observations
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.spaces.actions import make_actions
 

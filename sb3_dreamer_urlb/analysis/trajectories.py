@@ -13,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import SequenceBatch
 
@@ -96,7 +97,7 @@ def _first_episodes(model: DreamerV2, env: VecEnv, normalizer: VecNormalize | No
         observation, reward, start, infos = env.step(action)
         rows = _rows(model, observation)
         for i in np.flatnonzero(going):
-            last = infos[i]["terminal_observation"] if start[i] else None
+            last = infos[i][TERMINAL] if start[i] else None
             seen[i].append(rows[i] if last is None else _rows(model, last)[0])
             actions[i].append(action[i])
             rewards[i].append(float(reward[i]))

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage
 
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.envs.intercepting import intercept
 
-#: key of an ``info``: the observation with which an episode ended
-TERMINAL = "terminal_observation"
 #: attribute of what a VecNormalize wraps: those of the episodes that ended with its last step, by number of environment
 ENDS = "_ends_of_last_step"
 

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 from stable_baselines3.common.vec_env.util import dict_to_obs, obs_space_info
 
 from sb3_dreamer_urlb.envs.faults import FAULT, FAULTS, EnvironmentFaultError, FaultCounter, check_finite_action, closed
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL, TRUNCATED
 from sb3_dreamer_urlb.envs.worker import Worker, WorkerFault, end_all, start_context
 
 #: seconds that close() gives workers before it ends them by force
@@ -140,8 +141,8 @@ class SupervisedVecEnv(VecEnv):
         info = {
             FAULT: reason,
             FAULTS: self.counters[i].take(),
-            "TimeLimit.truncated": True,
-            "terminal_observation": self._last[i],
+            TRUNCATED: True,
+            TERMINAL: self._last[i],
         }
         return observation, 0.0, True, info, reset_info
 

@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium
 
 from sb3_dreamer_urlb.envs.faults import FaultGuard, describe
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL, TRUNCATED
 from sb3_dreamer_urlb.envs.touches import with_own_observation
 
 OK, RAISED = "ok", "raised"
@@ -76,9 +77,9 @@ def _portable(error: Exception) -> Exception:
 def _step(env: gymnasium.Env, action: Any) -> tuple[Any, ...]:
     observation, reward, terminated, truncated, info = with_own_observation(env.step(action))
     reset_info: dict[str, Any] = {}
-    info = {**info, "TimeLimit.truncated": truncated and not terminated}
+    info = {**info, TRUNCATED: truncated and not terminated}
     if terminated or truncated:
-        info["terminal_observation"] = observation
+        info[TERMINAL] = observation
         observation, reset_info = env.reset()
     return observation, reward, terminated or truncated, info, reset_info
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 
 from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
 from sb3_dreamer_urlb.types import Observation
 
@@ -152,7 +153,7 @@ def record(model: AgentAlgorithm, env: VecEnv, max_steps: int, deterministic: bo
         frames.append(_picture(model, env, observation))
         action, state = model.predict(observation, state, start, deterministic)
         observation, _, start, infos = env.step(action)
-        last = infos[0].get("terminal_observation") if start[0] else None
+        last = infos[0].get(TERMINAL) if start[0] else None
         observations.append(observation if last is None else _batch_of_one(last))
         actions.append(action[0])
     fps = env_attribute(env, "metadata", {}).get("render_fps") or DEFAULT_FPS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any, ClassVar
 
 import torch as th
@@ -69,15 +70,17 @@ class Planner(ABC):
         :raises ValueError: for anything else, naming class, method and both forms
         """
         found = given if isinstance(given, tuple) else (given,)
-        if all(isinstance(one, th.Tensor) for one in found) and len(found) == len(shapes):
-            pairs = [
-                pair
-                for one, shape in zip(found, shapes, strict=True)
-                for pair in zip((len(one.shape), *one.shape), (len(shape), *shape), strict=False)
-            ]
-            free = {size for size, wanted in pairs if wanted is None}
-            if len(free) <= 1 and all(wanted in (None, size) for size, wanted in pairs):
-                return given
+        if all(isinstance(one, th.Tensor) for one in found) and _of_form([one.shape for one in found], shapes):
+            return given
         wanted_form = ", ".join(str(tuple(shape)).replace("None", "k") for shape in shapes)
         form = ", ".join(str(tuple(one.shape)) if isinstance(one, th.Tensor) else type(one).__name__ for one in found)
         raise ValueError(f"{type(self).__qualname__}.{method} must return {wanted_form}, got {form}.")
+
+
+def _of_form(found: Sequence[Sequence[int]], wanted: Sequence[Sequence[int | None]]) -> bool:
+    """Whether shapes are as wanted, and all sizes that are free, None, are one."""
+    if [*map(len, found)] != [*map(len, wanted)]:
+        return False
+    pairs = [*zip(chain(*found), chain(*wanted), strict=True)]
+    free = {size for size, expected in pairs if expected is None}
+    return len(free) <= 1 and all(expected in (None, size) for size, expected in pairs)

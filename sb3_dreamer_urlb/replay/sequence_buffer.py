@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.envs.domain_rewards import KEY
 from sb3_dreamer_urlb.envs.env_steps import is_fault
+from sb3_dreamer_urlb.envs.info_keys import TRUNCATED
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import DeviceEpisode
@@ -250,7 +251,7 @@ class SequenceReplayBuffer(ReplayBuffer):
             episode = self.open[i]
             if episode is None:
                 episode = self.open[i] = Episode(self._row(obs, i), action[i].size, skill[i], len(self.tasks))
-            terminal = bool(done[i]) and not infos[i].get("TimeLimit.truncated", False)
+            terminal = bool(done[i]) and not infos[i].get(TRUNCATED, False)
             paid = self._paid(infos[i]) if self.tasks else ()
             episode.append(self._row(next_obs, i), action[i].reshape(-1), float(reward[i]), terminal, skill[i], paid)
             if done[i] or len(episode) >= self.max_episode_rows:
