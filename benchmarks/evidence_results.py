@@ -110,7 +110,8 @@ def draw(path: Path) -> None:
     import matplotlib.pyplot as plt
 
     episodes = study.curves()
-    tasks = list(scores())
+    # An interval takes two runs at least.
+    tasks = [task for task, arms in scores().items() if any(len(values["whole"]) > 1 for values in arms.values())]
     figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 2.6)
     for axes, task in zip(panels, tasks, strict=True):
         for i, (arm, label) in enumerate(LABELS.items()):

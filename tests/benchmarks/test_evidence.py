@@ -12,6 +12,7 @@ from places import ROOT
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.style import new_figure
 
 COLUMNS = (
     "method,domain,task,seed,pretrain_frames,finetune_frames,keep_actor,keep_critic,planner,preset,return_mean,return_std,"
@@ -135,3 +136,12 @@ def test_curves_are_drawn(study, evidence, results, tmp_path):
     (study.ROOT / "rows.csv").write_text(COLUMNS + "\n")
     results.draw(tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 5000
+
+
+def test_no_panel_for_a_single_run(study, evidence, results, tmp_path, monkeypatch):
+    write(study, evidence, {"run": {"scratch": [[1, 2], [2, 3]]}, "flip": {"scratch": [[1, 2]], "lbs-kept": [[5, 6]]}})
+    (study.ROOT / "rows.csv").write_text(COLUMNS + "\n")
+    panels = []
+    monkeypatch.setattr(results, "new_figure", lambda count, *size: panels.append(count) or new_figure(count, *size))
+    results.draw(tmp_path / "curves.png")
+    assert panels == [1]
