@@ -20,7 +20,7 @@ class Pace:
     """Seconds that the parts of a run take.
 
     :param update: of the agent
-    :param plan: a planned action, with what the agent sees before it
+    :param plan: a planned action, with what the agent sees before it; of all environments that are planned for at once
     :param act: the actor's action, likewise
     :param step: a step of the environment, drawn
     """
@@ -66,22 +66,24 @@ def phase(model: DreamerV2, frames: int, plans: bool) -> Amount:
     return Amount(steps, updates, max(0, learning - model.planner_delay) if plans else 0)
 
 
-def measure(model: DreamerV2, env: gymnasium.Env, repeat: int = 2) -> Pace:
+def measure(model: DreamerV2, env: gymnasium.Env, planned: int = 1, repeat: int = 2) -> Pace:
     """Time the parts of a run: the best of some, after one that does not count.
 
     :param model: learns, so it is one that nobody needs
     :param env: one environment of its kind
+    :param planned: environments that are planned for at once
     :param repeat: how often each part is timed
     """
     policy, batch = model.policy, _batch(model)
     assert isinstance(batch.observation, th.Tensor)  # pixels or a vector
     seen = batch.observation[0, :1]
-    state = policy.initial_state(1)
-    first = th.ones(1, dtype=th.bool, device=model.device)
 
     def act(plans: bool) -> None:
+        rows = planned if plans else 1
         policy.planning = plans
-        policy.choose(policy.observe(seen, state, first), deterministic=False)
+        first = th.ones(rows, dtype=th.bool, device=model.device)
+        beginning = policy.initial_state(rows)
+        policy.choose(policy.observe(seen.expand(rows, *seen.shape[1:]), beginning, first), deterministic=False)
 
     def step() -> None:
         _, _, terminated, truncated, _ = env.step(env.action_space.sample())

@@ -35,6 +35,8 @@ LIMIT = 15 * 60.0
 LEAST = 0.4
 #: the two agents, in the order of their columns
 SCRATCH, PRETRAINED = "from scratch", "pre-trained"
+#: how long two agents beside each other take where one alone takes 1: they share caches and memory (measured on two cores)
+BESIDE = 1.3
 #: seconds between two looks at the agents' progress
 LOOK = 1.0
 
@@ -135,7 +137,7 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
     """
     env = demo_agents.make_env(env_id(DOMAIN, config.task))
     model = DreamerV2("MlpPolicy", env, preset=config.preset, planner="dyna_mpc", seed=config.seed, device="cpu")
-    its_pace = pace.measure(model, env.venv.envs[0])  # type: ignore[attr-defined]
+    its_pace = pace.measure(model, env.venv.envs[0], config.episodes)  # type: ignore[attr-defined]
     env.close()
     changeable = config.finetune_frames == DemoConfig.finetune_frames
 
@@ -149,13 +151,12 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
     def seconds(share: float) -> float:
         episode = EPISODE // model.action_repeat
         steps = config.episodes * episode
-        # Evaluations play all their episodes at once; one planned action for ten costs about as much as for three or four.
-        played = pace.Amount(2 * steps + demo_agents.FILM_STEPS, 0, 0).seconds(its_pace)
-        played += max(0.4 * config.episodes, 1.0) * episode * its_pace.plan
+        # Evaluations play all their episodes at once.
+        played = pace.Amount(2 * steps + demo_agents.FILM_STEPS, 0, 0).seconds(its_pace) + episode * its_pace.plan
         learning = pace.phase(model, at(share).finetune_frames, False).seconds(its_pace)
         before = pace.phase(model, config.pretrain_frames, False).seconds(its_pace)
         random = steps * its_pace.step
-        return before + (learning + played) * 2 / _at_once() + random
+        return before + (learning + played) * (BESIDE if _at_once() > 1 else 2) + random
 
     share = pace.shrink(seconds, limit, LEAST)
     chosen = at(share)

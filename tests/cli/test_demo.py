@@ -120,19 +120,19 @@ def fitted(monkeypatch, update, **config):
 def test_a_slow_machine_takes_fewer_frames_and_says_so(monkeypatch, capsys):
     assert fitted(monkeypatch, 0.1) == DemoConfig()  # 1800 updates
     printed = capsys.readouterr().out
-    assert "in place of" not in printed and "will take about 3 minutes" in printed
+    assert "in place of" not in printed and "will take about 4 minutes" in printed
     slow = fitted(monkeypatch, 0.75)
     assert 20_000 * side_by_side.LEAST <= slow.finetune_frames < 20_000 and slow.finetune_frames % 1000 == 0
     printed = capsys.readouterr().out
-    assert f"{slow.finetune_frames} frames in place of 20000" in printed and "would take about 22 minutes" in printed
+    assert f"{slow.finetune_frames} frames in place of 20000" in printed and "would take about 29 minutes" in printed
     assert fitted(monkeypatch, 100.0).finetune_frames == 8000
     assert fitted(monkeypatch, 100.0, finetune_frames=30_000).finetune_frames == 30_000
 
 
-@pytest.mark.parametrize(("episodes", "words"), [(1, "about 8 minutes"), (10, "about 33 minutes")])
+@pytest.mark.parametrize(("episodes", "words"), [(1, "about 11 minutes"), (10, "about 43 minutes")])
 def test_evaluations_count_and_what_does_not_is_named(monkeypatch, capsys, episodes, words):
-    """An action a step is planned at least, however few episodes are played at once."""
-    monkeypatch.setattr(pace, "measure", lambda *_: Pace(0.0, 1.0, 0.0, 0.0))
+    """All episodes are played at once, and a step of all is planned together."""
+    monkeypatch.setattr(pace, "measure", lambda model, env, planned: Pace(0.0, {1: 1.0, 10: 4.0}[planned], 0.0, 0.0))
     monkeypatch.setattr(side_by_side, "_at_once", lambda: 2)
     side_by_side.fitted(DemoConfig(finetune_frames=1000, episodes=episodes))
     assert f"Learning and playing will take {words}; starting" in capsys.readouterr().out

@@ -23,9 +23,19 @@ def test_a_phase_counts_warm_up_updates_and_plans(tiny_model):
     ) == 54 * 0.125 + 34 * 0.5 + 20 * 0.25 + 10
 
 
-def test_parts_are_timed(tiny_model):
-    found = pace.measure(tiny_model(planner="dyna_mpc", intrinsic_reward="lbs"), CounterEnv(8))
+@pytest.mark.parametrize("planned", [1, 12])
+def test_parts_are_timed(tiny_model, monkeypatch, planned):
+    model, rows = tiny_model(planner="dyna_mpc", intrinsic_reward="lbs"), set()
+    choose = model.policy.choose
+
+    def choosing(state, **kwargs):
+        rows.add((model.policy.planning, len(state.steps)))
+        return choose(state, **kwargs)
+
+    monkeypatch.setattr(model.policy, "choose", choosing)
+    found = pace.measure(model, CounterEnv(8), planned)
     assert min(found.update, found.plan, found.act, found.step) > 0
+    assert rows == {(True, planned), (False, 1)}
 
 
 @given(st.floats(0.01, 1e5), st.floats(0.01, 1e5), st.floats(0.05, 0.9))
