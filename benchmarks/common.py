@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import math
 import os
@@ -26,6 +25,7 @@ from stable_baselines3.common.utils import get_device
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2, native
+from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 
 
 class NoiseImages(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -158,20 +158,15 @@ def _prepacked(x: Sequence[int], *_: Any, out_shape: Sequence[int], **__: Any) -
     return 2 * math.prod(x) * out_shape[-1]
 
 
-@functools.cache
 def multiplies_well(dtype: th.dtype, device: th.device) -> bool:
-    """Whether a small product takes less than four times what it takes in float32; it takes hundreds of times that where the
-    processor has no instructions for the format."""
+    """Whether a device has instructions for products of a format; without, they take hundreds of times what float32's take.
 
-    def quickest(its: th.dtype) -> float:
-        left, right = (th.ones(PROBE, PROBE, device=device).to(its) for _ in range(2))
-        return min(seconds(lambda: left @ right, 5, device))
-
-    return dtype == th.float32 or quickest(dtype) < 4 * quickest(th.float32)
-
-
-#: rows and columns of the product that tells whether the machine multiplies a format well
-PROBE = 256
+    It is asked, not timed: on a busy machine two threads may take longer over a small float32 product.
+    """
+    if dtype == th.float32:
+        return True
+    has_bfloat16 = cpu_multiplies_short() if device.type == "cpu" else th.cuda.is_bf16_supported(including_emulation=False)
+    return dtype == th.bfloat16 and has_bfloat16
 
 
 class Product:
