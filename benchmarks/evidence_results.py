@@ -41,6 +41,16 @@ FIGURE_REPETITIONS = 300
 Scores = dict[str, dict[str, dict[str, list[float]]]]
 
 
+def training_returns() -> dict[str, dict[str, list[list[float]]]]:
+    """Task → arm → of each finished run, the returns of its episodes in their order."""
+    found: dict[str, dict[str, list[list[float]]]] = {}
+    for name, episodes in study.curves().items():
+        task, arm, _ = name.split("/")
+        if "pretraining" not in task:
+            found.setdefault(task, {}).setdefault(arm, []).append([value for _, value in sorted(episodes)])
+    return found
+
+
 def scores() -> Scores:
     """Of all finished runs."""
     found: Scores = {}
@@ -48,10 +58,8 @@ def scores() -> Scores:
     def add(task: str, arm: str, measure: str, value: float) -> None:
         found.setdefault(task, {}).setdefault(arm, {name: [] for name in MEASURES})[measure].append(value)
 
-    for name, episodes in study.curves().items():
-        task, arm, _ = name.split("/")
-        if "pretraining" not in task:
-            returns = [value for _, value in sorted(episodes)]
+    for task, arms in training_returns().items():
+        for arm, returns in ((arm, one) for arm, runs in arms.items() for one in runs):
             add(task, arm, "whole", float(np.mean(returns)))
             add(task, arm, "last quarter", float(np.mean(returns[-max(len(returns) // 4, 1) :])))
     for row in read_rows(study.ROOT / "rows.csv", tasks=("finger-spin",)).rows:
@@ -109,13 +117,12 @@ def draw(path: Path) -> None:
     """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task."""
     import matplotlib.pyplot as plt
 
-    episodes = study.curves()
     # An interval takes two runs at least.
-    tasks = [task for task, arms in scores().items() if any(len(values["whole"]) > 1 for values in arms.values())]
+    tasks = {task: arms for task, arms in training_returns().items() if max(map(len, arms.values())) > 1}
     figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 2.6)
-    for axes, task in zip(panels, tasks, strict=True):
+    for axes, (task, arms) in zip(panels, tasks.items(), strict=True):
         for i, (arm, label) in enumerate(LABELS.items()):
-            runs = [[value for _, value in sorted(run)] for name, run in episodes.items() if name.startswith(f"{task}/{arm}/")]
+            runs = arms.get(arm, [])
             if len(runs) < 2:
                 continue
             length = min(map(len, runs))

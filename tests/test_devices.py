@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 import torch as th
-from helpers.fake_envs import CounterEnv
+from fake_envs import CounterEnv
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2
 
