@@ -31,11 +31,18 @@ from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
+from sb3_dreamer_urlb.unknown_names import UnknownNameError, check_keys, unexpected_arguments
 
 #: arguments of every replay that the algorithm fills in itself
 REPLAY_ARGUMENTS_OF_THE_MODEL = {
     "buffer_size", "observation_space", "action_space", "device", "n_envs", "batch_length", "phase", "skill_size", "tasks",
 }  # fmt: skip
+#: constructor arguments that change nothing of a file, and what does
+NOT_CHANGED = {
+    "preset": "presets fill in what a constructor is not told, and a file tells everything. Write the arguments to change, or "
+    "make a new model, {me}(..., preset=...)",
+    "policy": "a file says which it holds. A class that no file can hold is given with custom_objects={{'policy': ...}}",
+}
 #: range of a number: (low, low allowed, high, high allowed)
 Range = tuple[float, bool, float, bool]
 
@@ -264,10 +271,7 @@ def check_replay(model: SavedAlgorithm, base: type[SequenceReplayBuffer], filled
 
 
 def _check_names(name: str, given: dict[str, Any], kind: type, filled_in: set[str]) -> None:
-    known = set(named_parameters(kind)) - filled_in
-    unknown = sorted(set(given) - known)
-    if unknown:
-        raise ValueError(f"Unknown {name} {unknown}; known are {sorted(known)}.")
+    check_keys(name, given, set(named_parameters(kind)) - filled_in)
 
 
 def check_env(model: SavedAlgorithm, env: VecEnv) -> None:
@@ -289,9 +293,12 @@ def check_env(model: SavedAlgorithm, env: VecEnv) -> None:
 def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any]) -> None:
     """SB3 would silently set any keyword as an attribute.
 
-    :raises TypeError: for a keyword that is no constructor argument, or one that only makes sense there
+    :raises UnknownNameError: for a keyword that is no constructor argument, or one that only makes sense there
     """
-    known = set(algorithm.argument_names()) - {"preset"} | {"device"}
-    unknown = sorted(set(kwargs) - known)
-    if unknown:
-        raise TypeError(f"load() got unknown keywords {unknown}; known are {sorted(known)}.")
+    me = algorithm.__name__
+    for name, why in NOT_CHANGED.items():
+        if name in kwargs:
+            raise UnknownNameError(f"{me}.load: got an unexpected keyword argument {name!r}: {why.format(me=me)}.")
+    known = [*algorithm.argument_names(), "device"]
+    if unknown := [name for name in kwargs if name not in known]:
+        raise unexpected_arguments(f"{me}.load", unknown, known, f"help({me})")

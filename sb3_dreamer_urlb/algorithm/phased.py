@@ -31,6 +31,7 @@ from sb3_dreamer_urlb.runs.resuming import resume_if_asked
 from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots.saved_algorithm import builds_networks
 from sb3_dreamer_urlb.types import MetricMeans
+from sb3_dreamer_urlb.unknown_names import did_you_mean
 
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
@@ -130,7 +131,8 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
             dicts = f": {type(self).__name__} takes no Dict observations" if policy_name == "MultiInputPolicy" else ""
-            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}{dicts}.")
+            meant = did_you_mean([policy_name], self.policy_aliases)
+            raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}{dicts}.{meant}")
         return self.policy_aliases[policy_name]
 
     def set_random_seed(self, seed: int | None = None) -> None:

@@ -8,8 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sb3_dreamer_urlb.number_checks import check_dict, is_choice, plain
+from sb3_dreamer_urlb.unknown_names import did_you_mean, unexpected_arguments
 
 Presets = dict[str, dict[str, Any]]
+#: of constructors, what no message proposes
+HIDDEN = ("self", "_init_setup_model")
 #: dictionaries that a user's own extend instead of replacing them
 MERGED = ("policy_kwargs", "planner_kwargs", "replay_buffer_kwargs")
 
@@ -26,10 +29,14 @@ def with_presets(
 
     def wrap(init: Callable[..., None]) -> Callable[..., None]:
         signature = inspect.signature(init)
+        known = [name for name in signature.parameters if name not in HIDDEN]
+        listed = init.__qualname__.split(".")[0]
 
         @functools.wraps(init)
         def wrapped(*args: Any, **kwargs: Any) -> None:
             args, kwargs = plain(args), plain(kwargs)
+            if unknown := [name for name in kwargs if name not in signature.parameters]:
+                raise unexpected_arguments(type(args[0]).__name__, unknown, known, f"help({listed})")
             try:
                 given = signature.bind_partial(*args, **kwargs).arguments
             except TypeError as error:
@@ -58,5 +65,5 @@ def find_preset(presets: Presets, name: str) -> dict[str, Any]:
     :raises ValueError: for an unknown name; the message lists the known ones
     """
     if not is_choice(name, presets):
-        raise ValueError(f"Unknown preset {name!r}; known are {sorted(presets)}.")
+        raise ValueError(f"Unknown preset {name!r}; known are {sorted(presets)}.{did_you_mean([name], presets)}")
     return presets[name]

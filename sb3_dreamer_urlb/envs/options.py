@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_dreamer_urlb.number_checks import is_choice, is_integer
+from sb3_dreamer_urlb.unknown_names import UnknownNameError, did_you_mean
 
 _MIN_SIZE, _MAX_SIZE = 16, 512  # pixels
 
@@ -17,10 +18,6 @@ OBSERVATIONS = ("pixels", "state", "both")
 
 #: what ``render()`` may do
 RENDER_MODES = ("rgb_array", "human")
-
-
-class UnknownOptionError(ValueError, TypeError):
-    """An option that there is not: a wrong value as all others are, and the TypeError that Python has for wrong arguments."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +91,13 @@ def refuse_unknown(unknown: dict[str, Any], *others: str) -> None:
 
     :param unknown: by name, what was left over
     :param others: known ones besides those of :class:`PixelOptions`
-    :raises UnknownOptionError: if there are any; it lists the known ones
+    :raises UnknownNameError: if there are any; it lists the known ones
     """
     if unknown:
         known = sorted([*(field.name for field in fields(PixelOptions)), *others])
-        raise UnknownOptionError(
-            f"unknown option{'s' * (len(unknown) > 1)} {', '.join(unknown)}: known are {', '.join(known)}"
+        raise UnknownNameError(
+            f"unknown option{'s' * (len(unknown) > 1)} {', '.join(unknown)}: known are {', '.join(known)}."
+            f"{did_you_mean(unknown, known)}"
         )
 
 

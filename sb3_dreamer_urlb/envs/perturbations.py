@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dreamer_urlb.envs.options import UnknownOptionError, check_choice
+from sb3_dreamer_urlb.envs.options import check_choice
+from sb3_dreamer_urlb.unknown_names import UnknownNameError, did_you_mean
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
 
 #: the suite's degrees of intensity
@@ -135,7 +136,8 @@ def make_perturbations(given: Perturbations | Mapping[str, Any] | None) -> Pertu
     known = [field.name for field in fields(Perturbations)]
     unknown = [str(name) for name in given if name not in known]
     if unknown:
-        raise UnknownOptionError(f"unknown perturbation {', '.join(unknown)}: known are {', '.join(known)}")
+        meant = did_you_mean(unknown, known)
+        raise UnknownNameError(f"unknown perturbation {', '.join(unknown)}: known are {', '.join(known)}.{meant}")
     return Perturbations(**given)
 
 

@@ -9,6 +9,7 @@ from sb3_dreamer_urlb.intrinsic.base import IntrinsicReward
 from sb3_dreamer_urlb.intrinsic.method import ExplorationMethod
 from sb3_dreamer_urlb.intrinsic.skill_reward import SkillReward
 from sb3_dreamer_urlb.signatures import named_parameters
+from sb3_dreamer_urlb.unknown_names import check_keys, did_you_mean
 
 Method = TypeVar("Method", bound=ExplorationMethod)
 
@@ -41,7 +42,10 @@ def get_intrinsic_reward(name: str, kind: type[Method] = IntrinsicReward) -> typ
     if name in known:
         return known[name]
     other = f" ({name!r} reads {_REGISTRY[name].reads}, this agent's read {kind.reads})" if name in _REGISTRY else ""
-    raise ValueError(f"Unknown intrinsic_reward {name!r}; known are {sorted(known)}, and None for the task's reward{other}.")
+    meant = did_you_mean([name], known)
+    raise ValueError(
+        f"Unknown intrinsic_reward {name!r}; known are {sorted(known)}, and None for the task's reward{other}.{meant}"
+    )
 
 
 def registered_intrinsic_rewards(kind: type[Method] = IntrinsicReward) -> dict[str, type[Method]]:  # type: ignore[assignment]
@@ -81,10 +85,7 @@ def make_intrinsic_reward(
     missing = sorted(getattr(chosen, "__abstractmethods__", ()))
     if missing:
         raise ValueError(f"intrinsic_reward: {chosen.__qualname__} does not say what its {' and '.join(missing)} is.")
-    known = named_parameters(chosen)
-    unknown = sorted(set(kwargs) - set(known))
-    if unknown:
-        raise ValueError(f"Unknown intrinsic_kwargs {unknown} for {method!r}; known are {sorted(known)}.")
+    check_keys("intrinsic_kwargs", kwargs, named_parameters(chosen), repr(method))
     return _checked(chosen(**kwargs))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from sb3_dreamer_urlb.number_checks import check_dict
 from sb3_dreamer_urlb.planning.base import Planner
+from sb3_dreamer_urlb.unknown_names import check_keys, did_you_mean
 
 #: by registered name: the fields of the configuration that the name settles, whatever preset or user say about them, such as
 #: ``use_value=False`` of ``"mppi"``; filled by :func:`register_planner`
@@ -81,12 +82,10 @@ def make_planner(
     if not (planner is None or isinstance(planner, str) or (isinstance(planner, type) and issubclass(planner, Planner))):
         raise ValueError(f"planner must be a name, a subclass or an instance of Planner, or None, got {planner!r}.")
     if isinstance(planner, str) and planner not in _KINDS:
-        raise ValueError(f"Unknown planner {planner!r}; known are {sorted(_KINDS)} and None for the actor.")
+        meant = did_you_mean([planner], _KINDS)
+        raise ValueError(f"Unknown planner {planner!r}; known are {sorted(_KINDS)} and None for the actor.{meant}")
     kind, settled = _kind(planner, classes), PLANNERS.get(planner, {}) if isinstance(planner, str) else {}
-    known = sorted(field.name for field in dataclasses.fields(kind.config_class))
-    unknown = sorted(set(kwargs or {}) - set(known))
-    if unknown:
-        raise ValueError(f"Unknown planner_kwargs {unknown}; known are {known}.")
+    check_keys("planner_kwargs", kwargs or {}, (field.name for field in dataclasses.fields(kind.config_class)))
     config = kind.config_class(**{**(kwargs or {}), **settled})
     if planner is None or classes is None:
         return None

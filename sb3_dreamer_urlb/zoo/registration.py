@@ -5,7 +5,6 @@ rl_zoo3 has no entry points: its modules share two dictionaries and a class, whi
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 import sys
@@ -32,6 +31,7 @@ from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
+from sb3_dreamer_urlb.unknown_names import did_you_mean
 from sb3_dreamer_urlb.zoo import configs, env_arguments, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
@@ -149,9 +149,8 @@ def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperpar
         raise ValueError(f"The hyperparameters of {manager.env_name.gym_id} in {manager.config} name no policy.")
     for name in found[0]:
         if name not in known and name not in OWN_KEYS:
-            meant = difflib.get_close_matches(name, [*known, *OWN_KEYS])
-            hint = f"; did you mean {' or '.join(meant)}?" if meant else f": neither of rl_zoo3's nor of {manager.algo}'s."
-            raise ValueError(f"Unknown hyperparameter {name!r}{hint}")
+            meant = did_you_mean([name], [*known, *OWN_KEYS])
+            raise ValueError(f"Unknown hyperparameter {name!r}, neither of rl_zoo3's nor of {manager.algo}'s.{meant}")
     found[0].update(lines)
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 
 import gymnasium
 import numpy as np
@@ -235,9 +236,55 @@ def test_learn_says_what_it_takes(algorithm, policy, replay, method, kwargs, mes
 
 
 @each
-def test_an_argument_that_it_has_not_is_named_with_its_class(algorithm, policy, replay, method):
-    with pytest.raises(TypeError, match=f"{algorithm.__name__}: got an unexpected keyword argument 'plan'"):
-        make(algorithm, plan=1)
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("intrinsic", "'intrinsic_(kwargs|reward)' or 'intrinsic_(kwargs|reward)'"),
+        ("intrinsic_reward_kwargs", ".*'intrinsic_kwargs'"),
+        ("Learning_Rate", "'learning_rate'"),
+        ("freq", "'train_freq'"),
+        ("zzz", None),
+    ],
+)
+def test_an_argument_that_it_has_not_is_named_with_those_that_are_near(
+    algorithm, policy, replay, method, name, near, tmp_path
+):
+    path = tmp_path / "model"
+    make(algorithm).save(path)
+    me = algorithm.__name__
+    for caller, call in (
+        (me, lambda: make(algorithm, **{name: 1})),
+        (f"{me}.load", lambda: algorithm.load(path, **{name: 1})),
+        (f"{me}.load", lambda: algorithm.resume(tmp_path, **{name: 1})),
+    ):
+        with pytest.raises(TypeError) as caught:
+            call()
+        question = "" if near is None else rf" Did you mean {near}\?"
+        assert re.fullmatch(
+            rf"{caller}: got an unexpected keyword argument '{name}'\.{question} help\({me}\) lists all\.", str(caught.value)
+        )
+
+
+@each
+def test_what_load_changes_nothing_by_is_answered_in_its_own_words(algorithm, policy, replay, method, tmp_path):
+    make(algorithm).save(tmp_path / "model")
+    for name, message in (("preset", r"make a new model, \w+\(\.\.\., preset=\.\.\.\)"), ("policy", "custom_objects={'policy'")):
+        with pytest.raises(TypeError, match=f"got an unexpected keyword argument '{name}': .*{message}") as caught:
+            algorithm.load(tmp_path / "model", **{name: "small"})
+        assert len(str(caught.value)) < 300
+
+
+@each
+def test_keys_of_dictionaries_are_answered_with_what_is_near(algorithm, policy, replay, method):
+    for kwargs, message in (
+        ({"policy_kwargs": {"netarch": [8]}}, r"Unknown policy_kwargs \['netarch'\]; known are .* Did you mean 'net_arch'\?"),
+        ({"replay_buffer_kwargs": {"rows": 8}}, "Did you mean 'max_episode_rows'"),
+        ({"preset": "Small"}, "Unknown preset 'Small'; known are .* Did you mean 'small'"),
+        ({"policy": "CNNPolicy"}, "Unknown policy 'CNNPolicy'; known are .* Did you mean 'CnnPolicy'"),
+        ({"intrinsic_reward": method[:-1]}, f"Did you mean '{method}'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make(algorithm, **kwargs)
 
 
 # -- predict ---------------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ def test_a_subclass_that_hands_arguments_on_is_saved_and_loaded(kind, arguments,
     observation = np.zeros((16, 16, 3), np.uint8)
     assert np.array_equal(*(one.predict(observation, deterministic=True)[0] for one in (model, loaded)))
     loaded.learn(20)
-    with pytest.raises(TypeError, match=r"unknown keywords.*gama"):
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'gama'\. Did you mean 'gamma'"):
         kind.load(tmp_path / "model", gama=0.5)
 
 
