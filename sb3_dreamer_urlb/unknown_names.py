@@ -11,7 +11,7 @@ NEAREST = 3
 
 
 class UnknownNameError(ValueError, TypeError):
-    """An argument that there is not: a wrong value as all others are, and the TypeError that Python has for wrong arguments."""
+    """An argument that there is not: a wrong value as all others are, and the TypeError that Python has for these."""
 
 
 def nearest(name: str, known: Iterable[str]) -> list[str]:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from sb3_dreamer_urlb.envs.options import check_choice
-from sb3_dreamer_urlb.unknown_names import UnknownNameError, did_you_mean
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
+from sb3_dreamer_urlb.unknown_names import UnknownNameError, did_you_mean
 
 #: the suite's degrees of intensity
 LEVELS = ("easy", "medium", "hard")

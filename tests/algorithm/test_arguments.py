@@ -268,7 +268,10 @@ def test_an_argument_that_it_has_not_is_named_with_those_that_are_near(
 @each
 def test_what_load_changes_nothing_by_is_answered_in_its_own_words(algorithm, policy, replay, method, tmp_path):
     make(algorithm).save(tmp_path / "model")
-    for name, message in (("preset", r"make a new model, \w+\(\.\.\., preset=\.\.\.\)"), ("policy", "custom_objects={'policy'")):
+    for name, message in (
+        ("preset", r"make a new model, \w+\(\.\.\., preset=\.\.\.\)"),
+        ("policy", "custom_objects={'policy'"),
+    ):
         with pytest.raises(TypeError, match=f"got an unexpected keyword argument '{name}': .*{message}") as caught:
             algorithm.load(tmp_path / "model", **{name: "small"})
         assert len(str(caught.value)) < 300

@@ -286,8 +286,11 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
 @pytest.mark.parametrize(
     ("param", "message"),
     [
-        ("presett:'small'", "Unknown hyperparameter 'presett', neither of rl_zoo3's nor of dreamerv2's. Did you mean 'preset'"),
-        ("zzz:1", "Unknown hyperparameter 'zzz': neither of rl_zoo3's nor of dreamerv2's."),
+        (
+            "presett:'small'",
+            "Unknown hyperparameter 'presett', neither of rl_zoo3's nor of dreamerv2's. Did you mean 'preset'",
+        ),
+        ("zzz:1", "Unknown hyperparameter 'zzz', neither of rl_zoo3's nor of dreamerv2's."),
         ("preset:tiny", "NameError: name 'tiny' is not defined. Values of -params"),
         ("batch_size:-1", "batch_size must be an integer of at least 1, got -1"),
         ("learning_rate:'fast'", "learning_rate must be a number or 'lin_' and a number, got 'fast'"),
