@@ -9,6 +9,7 @@ import torch as th
 from fake_envs import CounterEnv
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2
+from sb3_dreamer_urlb.devices import UnknownDeviceError, known_device
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [DreamerV2, DrQv2])
 
@@ -39,3 +40,38 @@ def test_a_device_that_is_here(algorithm, device):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device=device)
+
+
+@pytest.mark.parametrize(
+    ("device", "hint"),
+    [
+        ("gpu", ': torch calls it "cuda".'),
+        ("GPU:1", ': torch calls it "cuda:1".'),
+        ("metal", ': torch calls it "mps".'),
+        ("cud", ". Did you mean 'cuda'?"),
+        ("cuda:x", ". Did you mean 'cuda'?"),
+        ("tpu", "."),
+        ("nonsense", "."),
+        (None, "."),
+    ],
+)
+def test_a_device_that_torch_does_not_know(device, hint):
+    with pytest.raises(UnknownDeviceError) as caught:
+        known_device(device)
+    expected = f'device must be "auto", "cpu", "cuda", "cuda:1" or another of torch\'s, got {device!r}{hint}'
+    assert str(caught.value) == expected and isinstance(caught.value, ValueError) and isinstance(caught.value, RuntimeError)
+
+
+@ALGORITHMS
+def test_it_is_refused_wherever_a_device_is_taken(algorithm, tmp_path):
+    model = algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device="cpu")
+    model.save(tmp_path / "model")
+    model.policy.save(tmp_path / "policy")
+    for take in (
+        lambda: algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device="gpu"),
+        lambda: algorithm.load(tmp_path / "model", device="gpu"),
+        lambda: type(model.policy).load(tmp_path / "policy", device="gpu"),
+        lambda: setattr(model, "device", "gpu"),
+    ):
+        with pytest.raises(UnknownDeviceError, match='torch calls it "cuda"'):
+            take()

@@ -6,8 +6,8 @@ import functools
 from typing import Any, ClassVar
 
 import numpy as np
-from stable_baselines3.common.utils import get_device
 
+from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.number_checks import plain
 from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm
 
@@ -55,7 +55,7 @@ class AssignableArguments(SavedAlgorithm):
         if self.assignable is None or "policy" not in vars(self) or name not in _watched_arguments(type(self)):
             super().__setattr__(name, value)
             return
-        if name == DEVICE and get_device(value) == self.device:
+        if name == DEVICE and known_device(value) == self.device:
             return
         if name not in self.assignable:
             raise AttributeError(

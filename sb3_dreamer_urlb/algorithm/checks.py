@@ -11,7 +11,6 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.normalized import hides_originals
@@ -26,7 +25,7 @@ from sb3_dreamer_urlb.number_checks import (
     is_integer,
     is_number,
 )
-from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.phases import PHASES, PRETRAINING
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
@@ -274,20 +273,25 @@ def _check_names(name: str, given: dict[str, Any], kind: type, filled_in: set[st
     check_keys(name, given, set(named_parameters(kind)) - filled_in)
 
 
-def check_env(model: SavedAlgorithm, env: VecEnv) -> None:
-    """Whether a model can go on in another environment.
+def check_pretrains(model: SavedAlgorithm) -> None:
+    """Whether there is a pre-training to leave.
 
-    :param model: with its spaces
-    :param env: vectorised
-    :raises AssertionError: for another number of environments, as SB3's ``set_env``
-    :raises ValueError: for other spaces
+    :param model: that is to be fine-tuned
+    :raises ValueError: if it never was pre-trained, or has left that behind
     """
-    if env.num_envs != model.n_envs:
-        raise AssertionError(
-            f"The number of environments differs from the model's: {env.num_envs} != {model.n_envs}. "
-            f"To change it, load a snapshot with the new ones: {type(model).__name__}.load(path, env=...)."
+    if PHASES[model.phase].explores:
+        return
+    me = type(model).__name__
+    if model.arguments().get("intrinsic_reward") is None:
+        raise ValueError(
+            "fine_tune() needs a pre-trained model, and this one was never pre-trained: it was made without an "
+            f"intrinsic_reward and learns its task at once. Go on with learn(), or make one that explores first: "
+            f"{me}(..., intrinsic_reward=...)."
         )
-    check_for_correct_spaces(env, model.observation_space, model.action_space)
+    raise ValueError(
+        f"fine_tune() needs a model in the phase {PRETRAINING!r}, this one is in {model.phase!r}: "
+        "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
+    )
 
 
 def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm import left_environments
+from sb3_dreamer_urlb.algorithm.environment_checks import needed_env
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.algorithm.training_loop import LearningVecEnv
 from sb3_dreamer_urlb.envs import env_steps
@@ -101,7 +102,8 @@ class CollectingAlgorithm(SavingAlgorithm):
         :param log_interval: episodes between two log lines
         :return: steps and episodes of the rollout
         """
-        assert self.env is not None and (env.num_envs == 1 or train_freq.unit == TrainFrequencyUnit.STEP), (
+        needed_env(self, "collect_rollouts")
+        assert env.num_envs == 1 or train_freq.unit == TrainFrequencyUnit.STEP, (
             "You must use only one env when doing episodic training."
         )
         self.policy.set_training_mode(False)
@@ -223,11 +225,14 @@ class CollectingAlgorithm(SavingAlgorithm):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def restart_episodes(self) -> None:
-        """Reset all environments in the middle of ``learn``, because they changed."""
-        assert self.env is not None
+        """Reset all environments in the middle of ``learn``, because they changed.
+
+        :raises MissingEnvironmentError: if there are none
+        """
+        env = needed_env(self, "restart_episodes")
         self.replay_buffer.close_streams()
-        self._last_obs = self.env.reset()  # type: ignore[assignment]
-        self._last_episode_starts = np.ones(self.env.num_envs, bool)
+        self._last_obs = env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(env.num_envs, bool)
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:

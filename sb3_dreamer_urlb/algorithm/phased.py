@@ -18,6 +18,7 @@ from sb3_dreamer_urlb import phases, transfer_rule
 from sb3_dreamer_urlb.algorithm import checks, left_environments, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
+from sb3_dreamer_urlb.algorithm.environment_checks import check_env, needed_env
 from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
@@ -131,7 +132,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         if policy_name not in self.policy_aliases:
             dicts = f": {type(self).__name__} takes no Dict observations" if policy_name == "MultiInputPolicy" else ""
-            meant = did_you_mean([policy_name], self.policy_aliases)
+            meant = "" if dicts else did_you_mean([policy_name], self.policy_aliases)
             raise ValueError(f"Unknown policy {policy_name!r}; known are {sorted(self.policy_aliases)}{dicts}.{meant}")
         return self.policy_aliases[policy_name]
 
@@ -180,7 +181,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
             super().__setattr__(name, value)
 
     def _check_env(self, env: VecEnv) -> None:
-        checks.check_env(self, env)
+        check_env(self, env)
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """As SB3's; also checks what else the model needs of it, and reads the new environment's action repeat.
@@ -243,11 +244,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         """
         keep_actor, keep_critic, keep_reward = plain((keep_actor, keep_critic, keep_reward))
         checks.check_kept(keep_actor, keep_critic, keep_reward)
-        if self.phase != phases.PRETRAINING:
-            raise ValueError(
-                f"fine_tune() needs a model in the phase {phases.PRETRAINING!r}, this one is in {self.phase!r}: "
-                "load the snapshot that was saved before the phases changed (SnapshotCallback), or go on with learn()."
-            )
+        checks.check_pretrains(self)
         if env is not None:
             env = self.prepare_fine_tuning_env(env)
         if keep_reward:
@@ -323,11 +320,13 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
         :raises ValueError: for what is no number of steps or episodes
+        :raises MissingEnvironmentError: if the model was loaded without an environment
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
         total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
         checks.check_learn(total_timesteps, log_interval)
+        needed_env(self, "learn")
         self.take_over_changes()
         with self.during_learn:
             if resume_if_asked(self, callback):

@@ -63,9 +63,10 @@ def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[An
     :param envs: how many environments
     :param arguments: of the model, in place of those in the file
     """
+    from sb3_dreamer_urlb.devices import known_device
     from sb3_dreamer_urlb.evaluation.loading import algorithm_of
 
-    check_device(options["device"])
+    known_device(options["device"])
     path, env = _file(options["snapshot"]), environment_of(options, envs)
     try:
         with _hinting_at_states(env):
@@ -73,19 +74,6 @@ def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[An
     except BaseException:
         env.close()
         raise
-
-
-def check_device(device: str) -> None:
-    """
-    :param device: of torch, or ``"auto"``
-    :raises ValueError: if there is none of that name
-    """
-    from stable_baselines3.common.utils import get_device
-
-    try:
-        get_device(device)
-    except RuntimeError as error:
-        raise ValueError(f"--device {device}: {str(error).splitlines()[0]}") from error
 
 
 @contextmanager

@@ -51,7 +51,7 @@ def run(options: dict[str, Any]) -> int:
 
     from sb3_dreamer_urlb.analysis.manifests import MANIFESTS, runs_of
     from sb3_dreamer_urlb.analysis.study import StudyFolder, normalized_states
-    from sb3_dreamer_urlb.cli.agents import check_device
+    from sb3_dreamer_urlb.devices import known_device
     from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
     from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
     from sb3_dreamer_urlb.number_checks import check_integer
@@ -61,7 +61,7 @@ def run(options: dict[str, Any]) -> int:
         check_integer("--at-most", options["at_most"], 1)
     if not options["minutes"] > 0:
         raise ValueError(f"--minutes must be more than 0, got {options['minutes']}.")
-    check_device(options["device"])
+    known_device(options["device"])
     get_preset(options["preset"])
     given: dict[str, Any] = {name.removesuffix("_frames"): options[name] for name in PLANNED if name in options}
     manifest = MANIFESTS[options["name"]]

@@ -13,13 +13,13 @@ from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
+from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 from sb3_dreamer_urlb.types import Observation
 
 if TYPE_CHECKING:
@@ -68,9 +68,9 @@ def env_to_play_in(model: AgentAlgorithm, env: GymEnv | str | None = None, argum
     if vec_env.num_envs != 1:
         raise ValueError(f"One environment is needed to play in, got {vec_env.num_envs}.")
     try:
-        check_for_correct_spaces(vec_env, model.observation_space, model.action_space)
+        check_same_spaces(vec_env, model)
     except ValueError as error:
-        raise ValueError(f"The environment to play in does not fit the model: {error}.{origin}") from error
+        raise ValueError(f"The environment to play in does not fit the model: {error}{origin}") from error
     return vec_env
 
 

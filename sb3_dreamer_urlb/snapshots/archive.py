@@ -244,6 +244,8 @@ class Archive:
         return {info.filename: info.file_size for info in members if info.filename != MANIFEST}
 
 
+#: what reads each kind of file
+READERS = {"model": "an algorithm's load", "policy": "a policy's load", "replay": "load_replay_buffer"}
 PICKLE = (
     "it is a pickle, as Stable-Baselines3 writes them, and loading it could run any code. If you trust where it comes "
     "from, convert it: sb3-dreamer-urlb convert OLD NEW --trust"
@@ -317,7 +319,11 @@ def _check_manifest(manifest: Any, kind: str) -> int:
     if not isinstance(manifest, dict) or set(manifest) != {"format", "kind", "version", "members"}:
         raise ValueError("its manifest has other fields than it should")
     if manifest["format"] != FORMAT or manifest["kind"] != kind:
-        raise ValueError(f"it is a {manifest['format']} {manifest['kind']} file, not a {FORMAT} {kind} file")
+        reader = READERS.get(str(manifest["kind"])) if manifest["format"] == FORMAT else None
+        raise ValueError(
+            f"it is a {manifest['format']} {manifest['kind']} file, not a {FORMAT} {kind} file"
+            f"{f': {reader} reads it' if reader else ''}"
+        )
     version, members = manifest["version"], manifest["members"]
     if type(version) is not int or version < 1:
         raise ValueError(f"its version is {version!r}")

@@ -11,15 +11,16 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
+from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
-from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, describe, needed, restore_fields
+from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, check_whose, describe, needed, restore_fields
 from sb3_dreamer_urlb.snapshots.random_state import RandomStates
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
+from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 
@@ -174,7 +175,7 @@ def _prepared(
         model = blank(algorithm, data, device, custom, kwargs)
         restore_fields(model, data)
         if env is not None:
-            check_for_correct_spaces(env, model.observation_space, model.action_space)
+            check_same_spaces(env, model)
             model.env, model.n_envs = env, env.num_envs
             model._vec_normalize_env = unwrap_vec_normalize(env)
         model._prepare()
@@ -275,6 +276,7 @@ def set_parameters(model: SavedAlgorithm, source: Target, exact_match: bool) -> 
         own = tensors.table_of(_named(model.policy))
         found, _ = normalization.split(tensors.read_table(archive, TENSORS))
         if exact_match:
+            check_whose(type(model), archive.data)
             tensors.compare(found, _with_moments(model, own, found))
             loaded = tensors.unpack(archive, TENSORS)
             _put(model, {name: loaded[name] for name in found})

@@ -17,7 +17,7 @@ from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.signatures import constructed, named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.random_state import capture
-from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm, without_networks
+from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm, public_algorithms, without_networks
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 
@@ -109,9 +109,7 @@ def blank(
     """
     known = algorithm.argument_names()
     arguments = dict(data["arguments"])
-    unknown = sorted(set(arguments) - set(known))
-    if unknown:
-        raise ValueError(f"it has an argument {unknown[0]!r}, which {algorithm.__name__} has not: is it another algorithm's?")
+    check_whose(algorithm, data)
     given = {**{name: value for name, value in custom.items() if name in known and name != "preset"}, **kwargs}
     _check_method(arguments, given)
     if isinstance(given.get("planner"), Planner):
@@ -146,6 +144,23 @@ def blank(
     model = _constructed(algorithm, {**given_by_us, "preset": "paper", **decoded})
     model.preset = preset
     return model
+
+
+def check_whose(algorithm: type[SavedAlgorithm], data: dict[str, Any]) -> None:
+    """Whether a class can have saved a file.
+
+    :param algorithm: the class
+    :param data: of the file
+    :raises ValueError: if it is another algorithm's, or a subclass's with arguments of its own
+    """
+    stored, me = set(data["arguments"]), algorithm.__name__
+    unknown = sorted(stored - set(algorithm.argument_names()))
+    if not unknown:
+        return
+    its = next((kind.__name__ for kind in public_algorithms() if stored <= set(kind.argument_names())), None)
+    if its is not None:
+        raise ValueError(f"it holds a model of {its}, not of {me}: {its}.load reads it")
+    raise ValueError(f"it has an argument {unknown[0]!r}, which {me} has not: the load of the class that saved it reads it")
 
 
 def _extended(name: str, stored: Any, given: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
+from importlib import import_module
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -100,3 +101,10 @@ class SavedAlgorithm(OffPolicyAlgorithm):
         """The constructor arguments, as the model has them now; without those that a subclass keeps nowhere."""
         attributes = {name: ATTRIBUTES.get(name, name) for name in self.argument_names()}
         return {name: getattr(self, attribute) for name, attribute in attributes.items() if hasattr(self, attribute)}
+
+
+def public_algorithms() -> list[type[SavedAlgorithm]]:
+    """Those that this package offers, for messages; imported now, for who loads a file has asked for one of them only."""
+    package = import_module(__name__.partition(".")[0])
+    kinds = [getattr(package, name) for name in package.__all__]
+    return [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, SavedAlgorithm)]

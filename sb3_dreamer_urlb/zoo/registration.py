@@ -15,17 +15,16 @@ from pprint import pprint
 from typing import Any
 from unittest import mock
 
-import torch as th
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
 from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback
 from sb3_dreamer_urlb.callbacks.videos import VideoCallback
+from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
@@ -85,7 +84,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     :raises ValueError: if there is no file to read, for values of the three keys that mean nothing, for a run that is still
         going
     """
-    _check_device(manager.device)
+    known_device(manager.device)
     options = manager.args
     run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
     given, manager.env_kwargs = manager.env_kwargs, {}  # rl_zoo3 would forget the configuration's
@@ -122,13 +121,6 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     if run is not None:
         _go_on(manager, run)
     return hyperparams, config
-
-
-def _check_device(device: th.device | str) -> None:
-    try:
-        get_device(device)
-    except RuntimeError as error:
-        raise ValueError(f"--device {device}: {error}") from error
 
 
 def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> tuple[Any, ...]:

@@ -396,7 +396,7 @@ def test_a_list_of_the_right_shape_is_an_observation(tiny_model):
         ({"batch_size": 0}, ValueError, "^batch_size must be an integer of at least 1, got 0"),
         ({"custom_objects": {"gamma": 3}}, ValueError, r"^gamma must lie in \(0, 1\], got 3"),
         ({"custom_objects": 3}, TypeError, "^custom_objects must be a dictionary of arguments by name or None, got 3"),
-        ({"device": "nonsense"}, RuntimeError, "^Expected one of cpu"),
+        ({"device": "nonsense"}, RuntimeError, r"^device must be .*, got 'nonsense'\.$"),
         ({"env": 3}, ValueError, "^env must be an environment of Gymnasium, a VecEnv or an id, got 3"),
         ({"seed": "a"}, ValueError, r"^seed must be an integer .*got 'a'"),
         ({"planner": "cem"}, ValueError, "^Unknown planner 'cem'"),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import shutil
+import subprocess
+import sys
 import warnings
 from itertools import pairwise
 
@@ -488,8 +490,20 @@ def test_a_method_that_forgot_its_base_is_told():
 
 def test_a_file_of_the_other_algorithm_is_refused(tmp_path):
     tiny().save(tmp_path / "drq")
-    with pytest.raises(SnapshotError, match="which DreamerV2 has not"):
-        DreamerV2.load(tmp_path / "drq", device="cpu")
+    DreamerV2("CnnPolicy", CounterEnv(), preset="tiny", device="cpu").save(tmp_path / "dreamer")
+    for mine, name, its in ((DreamerV2, "drq", "DrQv2"), (DrQv2, "dreamer", "DreamerV2")):
+        message = f"{name}.zip is refused: it holds a model of {its}, not of {mine.__name__}: {its}.load reads it"
+        with pytest.raises(SnapshotError, match=message):
+            mine.load(tmp_path / name, device="cpu")
+        with pytest.raises(SnapshotError, match=message):
+            mine("CnnPolicy", CounterEnv(), preset="tiny", device="cpu").set_parameters(tmp_path / name)
+
+
+def test_whose_a_file_is_is_known_where_nobody_imported_that_algorithm(tmp_path):
+    tiny().save(tmp_path / "drq")
+    code = "import sys; from sb3_dreamer_urlb import DreamerV2; DreamerV2.load(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "drq"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "DrQv2.load reads it" in done.stderr
 
 
 @pytest.mark.parametrize("other", [{"n_steps": 5}, {"n_steps": 1, "frame_stack": 1}, {"frame_stack": 4, "n_steps": 2}])

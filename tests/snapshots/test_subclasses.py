@@ -11,7 +11,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_dreamer_urlb import DreamerV2, DrQv2, SequenceReplayBuffer
+from sb3_dreamer_urlb import DreamerV2, DrQv2, SequenceReplayBuffer, SnapshotError
 from sb3_dreamer_urlb.dreamer_v2.policies import MlpPolicy
 from sb3_dreamer_urlb.drq_v2.policies import MlpPolicy as DrQMlpPolicy
 from sb3_dreamer_urlb.hub.model_card import changed_arguments
@@ -160,3 +160,17 @@ def test_parts_of_ones_own_may_want_their_arguments_by_name(algorithm, policy, r
     by_name.save(file)
     file.seek(0)
     assert ByName.load(file, device="cpu").mine == 7
+
+
+@each
+def test_a_file_with_arguments_of_a_class_of_ones_own_is_not_its_bases(algorithm, policy, replay, method):
+    class Extended(algorithm):
+        def __init__(self, *args, colour="red", **kwargs):
+            self.colour = colour
+            super().__init__(*args, **kwargs)
+
+    file = io.BytesIO()
+    Extended("MlpPolicy", make_env(), preset="tiny", device="cpu").save(file)
+    file.seek(0)
+    with pytest.raises(SnapshotError, match="argument 'colour', which .* has not: the load of the class that saved it reads it"):
+        algorithm.load(file)
