@@ -33,16 +33,17 @@ def chosen_device(device: th.device | str) -> th.device:
     return chosen
 
 
-def known_device(device: th.device | str) -> th.device:
+def known_device(device: th.device | str, argument: str = "device") -> th.device:
     """As Stable-Baselines3 chooses it, in silence.
 
     :param device: see :func:`chosen_device`
+    :param argument: what the caller calls it, for the message
     :raises UnknownDeviceError: likewise
     """
     try:
         return get_device(device)
     except (RuntimeError, TypeError) as error:
-        raise UnknownDeviceError(f"device must be {_usual()} or another of torch's, got {device!r}{_hint(device)}") from error
+        raise UnknownDeviceError(f"{argument} must be {_usual()} or another of torch's, got {device!r}{_hint(device)}") from error
 
 
 def _usual() -> str:

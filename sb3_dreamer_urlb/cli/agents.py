@@ -66,7 +66,7 @@ def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[An
     from sb3_dreamer_urlb.devices import known_device
     from sb3_dreamer_urlb.evaluation.loading import algorithm_of
 
-    known_device(options["device"])
+    known_device(options["device"], "--device")
     path, env = _file(options["snapshot"]), environment_of(options, envs)
     try:
         with _hinting_at_states(env):

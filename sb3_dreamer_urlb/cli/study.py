@@ -61,7 +61,7 @@ def run(options: dict[str, Any]) -> int:
         check_integer("--at-most", options["at_most"], 1)
     if not options["minutes"] > 0:
         raise ValueError(f"--minutes must be more than 0, got {options['minutes']}.")
-    known_device(options["device"])
+    known_device(options["device"], "--device")
     get_preset(options["preset"])
     given: dict[str, Any] = {name.removesuffix("_frames"): options[name] for name in PLANNED if name in options}
     manifest = MANIFESTS[options["name"]]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 import itertools
-from importlib import import_module
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib import import_module
 from types import MappingProxyType
 from typing import Any, ClassVar
 

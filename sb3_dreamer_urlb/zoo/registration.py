@@ -84,7 +84,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     :raises ValueError: if there is no file to read, for values of the three keys that mean nothing, for a run that is still
         going
     """
-    known_device(manager.device)
+    known_device(manager.device, "--device")
     options = manager.args
     run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
     given, manager.env_kwargs = manager.env_kwargs, {}  # rl_zoo3 would forget the configuration's

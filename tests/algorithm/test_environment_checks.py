@@ -33,7 +33,9 @@ def test_what_steps_needs_an_environment(algorithm, without_env):
         ("restart_episodes", without_env.restart_episodes),
     ):
         me = algorithm.__name__
-        with pytest.raises(ValueError, match=rf"^{name}\(\) needs an environment, .*set_env\(env\).*{me}\.load\(path, env") as it:
+        with pytest.raises(
+            ValueError, match=rf"^{name}\(\) needs an environment, .*set_env\(env\).*{me}\.load\(path, env"
+        ) as it:
             call()
         # As Stable-Baselines3's own.
         assert isinstance(it.value, AssertionError) and without_env.num_timesteps == before
@@ -66,7 +68,9 @@ def test_an_environment_with_other_spaces_is_refused_alike_wherever_it_is_given(
             give()
         told.add(str(caught.value))
     (message,) = told
-    assert message.startswith("Action spaces do not match: the model's is Box(-1.0, 1.0, (2,), float32), the environment's Box(")
+    assert message.startswith(
+        "Action spaces do not match: the model's is Box(-1.0, 1.0, (2,), float32), the environment's Box("
+    )
     assert message.endswith(f"make a new one: {algorithm.__name__}(policy, env).")
 
 

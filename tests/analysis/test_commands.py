@@ -112,7 +112,7 @@ def test_options_that_ask_for_nothing(snapshots, capsys):
         ("--rows {folder}/rows.csv --set planner=mppi", "--set planner: the evaluation measures that"),
         ("--rows {folder}/rows.csv --set seed=-1", "--set seed='-1'"),
         ("--rows {folder}/rows.csv --set ldd=much", "--set ldd='much'"),
-        ("--device foo", "--device foo"),
+        ("--device foo", "--device must be"),
         ("--env urlb/walker-fly-v0", "walker-fly"),
         ("--env=", "Malformed environment ID"),
         ("--env urlb/walker-run-v0", "needs --env-kwargs observation=state"),

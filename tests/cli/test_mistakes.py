@@ -82,7 +82,7 @@ def test_an_interruption_costs_a_line(args, line, capsys):
         ("compare A={folder},{folder}/. --out {folder}/page.html", "more than once"),
         ("study modules list --folder {file} --methods lbs", "is a file"),
         ("study modules list --folder {folder} --methods lbs --preset nope", "Unknown preset 'nope'"),
-        ("study modules list --folder {folder} --methods lbs --device foo", "--device foo"),
+        ("study modules list --folder {folder} --methods lbs --device foo", "--device must be"),
         ("study modules run --folder {folder} --methods lbs --minutes nan", "--minutes must be more than 0"),
         ("study modules run --folder {folder} --methods lbs --at-most -1", "--at-most must be an integer of at least 1"),
         ("study modules run --folder {folder} --methods lbs random", "keeps pre-trained actors: random trains none"),

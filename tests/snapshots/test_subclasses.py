@@ -172,5 +172,7 @@ def test_a_file_with_arguments_of_a_class_of_ones_own_is_not_its_bases(algorithm
     file = io.BytesIO()
     Extended("MlpPolicy", make_env(), preset="tiny", device="cpu").save(file)
     file.seek(0)
-    with pytest.raises(SnapshotError, match="argument 'colour', which .* has not: the load of the class that saved it reads it"):
+    with pytest.raises(
+        SnapshotError, match=r"argument 'colour', which .* has not: the load of the class that saved it reads it"
+    ):
         algorithm.load(file)

@@ -332,6 +332,7 @@ def test_a_wrong_configuration_costs_a_line(zoo, capsys, text, message):
 def test_an_environment_that_is_not_there_costs_a_line(zoo, capsys):
     assert f"maybe meant {STAND}" in refused(capsys, train, zoo, STAND.replace("stand", "stnd"))
     assert "No module named 'nowhere'" in refused(capsys, train, zoo, STAND, 8, "lbs", "--gym-packages", "nowhere")
+    assert "--device must be" in refused(capsys, train, zoo, STAND, 8, "lbs", "--device", "gpu")
     assert "got 'cud'. Did you mean 'cuda'?" in refused(capsys, train, zoo, STAND, 8, "lbs", "--device", "cud")
     Path("file").touch()
     assert "Not a directory" in refused(capsys, train, zoo, STAND, 8, "lbs", "-f", "file", params=TINY)
