@@ -11,7 +11,8 @@ trap 'rm -rf "$work"' EXIT
 
 "$python" -m venv "$work/venv"
 pip=("$work/venv/bin/python" -m pip --disable-pip-version-check)
-"${pip[@]}" install --quiet ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} "torch==$torch" -e ".[all]"
+[[ -z ${TORCH_INDEX:-} ]] || "${pip[@]}" install --quiet --no-deps --index-url "$TORCH_INDEX" "torch==$torch"
+"${pip[@]}" install --quiet "torch==$torch" -e ".[all]"
 "${pip[@]}" check
 
 {

@@ -7,8 +7,8 @@
 #
 # PYTHON       the Python that makes the environment (default python3)
 # VENV         where it is made (default .venv)
-# TORCH_INDEX  a further package index for torch, where the default one would bring a build that does not fit the
-#              machine (see the Makefile)
+# TORCH_INDEX  the package index that torch, and nothing else, comes from, where the default one would bring a build that
+#              does not fit the machine (see the Makefile)
 # MUJOCO_GL    egl or osmesa, where only that one is wanted; 'disable' skips the check for a GL library
 # pip's own settings (PIP_*, pip.conf) are respected as they are.
 set -euo pipefail
@@ -69,20 +69,28 @@ fingerprint() {
     } | cksum
 }
 
+# Torch alone comes from TORCH_INDEX: pip would ask a further index for every package, and wait for each where it is down.
+install_torch() {
+    say "torch from $TORCH_INDEX"
+    "${pip[@]}" install --quiet --no-deps --index-url "$TORCH_INDEX" --retries 2 --timeout 15 -c constraints.txt torch ||
+        die "no torch from TORCH_INDEX=$TORCH_INDEX (above: why): is the address right, and can this machine reach it?" \
+            "Without TORCH_INDEX, torch comes from pip's own index"
+}
+
 install_packages() {
-    local pip=("$venv/bin/python" -m pip --disable-pip-version-check) options=()
-    [[ -z ${TORCH_INDEX:-} ]] || options+=(--extra-index-url "$TORCH_INDEX")
-    say "installing the pinned packages (some 2 GB on the disk; a minute or two the first time)"
+    local pip=("$venv/bin/python" -m pip --disable-pip-version-check)
+    say "installing the pinned packages (some 2 GB on the disk; three to five minutes the first time)"
+    [[ -z ${TORCH_INDEX:-} ]] || install_torch
     if [[ -z ${TORCH_INDEX:-} && $(uname -s) == Linux ]] && ! command -v nvidia-smi >/dev/null &&
         ! "${pip[@]}" install -qq --dry-run --no-index --no-deps -c constraints.txt torch 2>/dev/null; then
         say "no NVIDIA GPU is seen; should pip now fetch several GB of CUDA packages, stop it and give the same command with" \
             "TORCH_INDEX=https://download.pytorch.org/whl/cpu"
     fi
     if [[ -t 1 ]]; then
-        "${pip[@]}" install "${options[@]}" -c constraints.txt -e '.[dev,plots,zoo]'
+        "${pip[@]}" install -c constraints.txt -e '.[dev,plots,zoo]'
     else
         # A log wants a line for each thing that takes its time, and no bars.
-        "${pip[@]}" install "${options[@]}" --progress-bar off -c constraints.txt -e '.[dev,plots,zoo]' |
+        "${pip[@]}" install --progress-bar off -c constraints.txt -e '.[dev,plots,zoo]' |
             awk '/^ *(Downloading|Building|Installing collected)/ { sub(/^ */, ""); print "setup: " substr($0, 1, 100); fflush() }'
     fi
 }
