@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import logging
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -206,6 +208,20 @@ def to_torchscript(step: ActingStep, path: str | os.PathLike[str]) -> None:
         th.jit.trace(step, step.example(), check_trace=False).save(os.fspath(path))
 
 
+@contextmanager
+def _exporter_without_remarks() -> Iterator[None]:
+    """Torch's exporter warns of itself, and logs which operators of torchvision, needless here, it does not find."""
+    registration = logging.getLogger("torch.onnx._internal.exporter._registration")
+    before = registration.level
+    registration.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        registration.setLevel(before)
+
+
 def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     """Write a step for ONNX runtimes, weights in the same file; any number of environments.
 
@@ -219,8 +235,7 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
         raise ImportError(f"Writing ONNX needs {' and '.join(missing)}; {how_to_install('export')}.")
     example = step.example()
     batch = th.export.Dim("n")
-    with th.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch's exporter about itself
+    with th.no_grad(), _exporter_without_remarks():
         th.onnx.export(
             step,
             example,
