@@ -19,6 +19,7 @@ from sb3_dreamer_urlb.algorithm import checks, left_environments, normalized, tr
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.algorithm.environment_checks import check_env, needed_env
+from sb3_dreamer_urlb.algorithm.updates_due import UpdatesDue
 from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
@@ -335,10 +336,12 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
                 total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
             )
             callbacks.on_training_start(locals(), globals())
+            due = UpdatesDue(self, total_timesteps)
             try:
                 training_loop.learn(self, total_timesteps, callbacks, log_interval, self._update, self.overlap)
             except (EnvironmentFaultError, NumericalFaultError) as error:
                 raise type(error)(f"{error} {save_last_good_state(self)}") from error
+            due.ended()
             callbacks.on_training_end()
             return self
 

@@ -75,6 +75,13 @@ class PhaseSwitchCallback(BaseCallback):
     def _on_training_start(self) -> None:
         # A learn() before this one, perhaps in another process, ended with the pre-training.
         self._switch_if_due()
+        model: PhasedAlgorithm = self.model  # type: ignore[assignment]
+        end = model.phase_frames + (model._total_timesteps - model.num_timesteps) * model.action_repeat
+        if model.phase == PRETRAINING and end < self.pretrain_frames:
+            warnings.warn(
+                f"This learn() will not reach the fine-tuning: it ends after {end} frames of pre-training, and "
+                f"PhaseSwitchCallback switches after pretrain_frames={self.pretrain_frames}."
+            )
 
     def _on_rollout_end(self) -> None:
         # Between rollouts, because a rollout holds on to its environment and replay buffer. If no step is left for the

@@ -80,6 +80,11 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
         self.attach()
         return len(self._drawn_from()) > 0
 
+    @property
+    def waits_for(self) -> str:
+        """What there has to be before :meth:`can_sample`, for people."""
+        return "a first step"
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> StepBatch:  # type: ignore[override]
         """Draw steps uniformly.
 

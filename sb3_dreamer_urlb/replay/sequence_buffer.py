@@ -336,6 +336,11 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.attach()
         return len(self.episodes) > 0 and self.finished_rows >= self.batch_length
 
+    @property
+    def waits_for(self) -> str:
+        """What there has to be before :meth:`can_sample`, for people."""
+        return f"episodes to end that have batch_length={self.batch_length} steps"
+
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceBatch:  # type: ignore[override]
         """Draw sequences, as ``sampling`` says.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -304,6 +306,17 @@ def test_a_switch_does_nothing_to_a_run_without_pretraining(tiny_model):
     with pytest.warns(UserWarning, match="nothing to switch: with intrinsic_reward=None"):
         model = tiny_model(vec_env()).learn(40, callback=PhaseSwitchCallback(8))
     assert model.phase_timesteps == 40
+
+
+@pytest.mark.parametrize(("frames", "told"), [(1000, True), (33, True), (32, False), (20, False)])
+def test_a_learn_that_ends_before_the_switch_says_so(tiny_model, frames, told):
+    model = tiny_model(vec_env(action_repeat=2), intrinsic_reward="lbs")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(16, callback=PhaseSwitchCallback(frames))
+    messages = [str(one.message) for one in caught if "PhaseSwitchCallback" in str(one.message)]
+    said = f"ends after 32 frames of pre-training, and PhaseSwitchCallback switches after pretrain_frames={frames}"
+    assert len(messages) == told and all(said in message for message in messages)
 
 
 def test_switch_announces_itself(tiny_model, capsys):

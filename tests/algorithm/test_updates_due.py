@@ -1,0 +1,70 @@
+"""Whoever asks for a learn() that cannot learn is told."""
+
+import warnings
+
+import pytest
+from fake_envs import CounterEnv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dreamer_urlb import DrQv2
+
+
+def told(model, steps: int, callback=None) -> list[str]:
+    """What learn() warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(steps, callback)
+    return [str(one.message) for one in caught if "update" in str(one.message)]
+
+
+class Stops(BaseCallback):
+    """At the first step."""
+
+    def _on_step(self) -> bool:
+        return False
+
+
+@given(
+    st.integers(0, 30),
+    st.integers(1, 7),
+    st.integers(1, 3),
+    st.lists(st.integers(1, 25), min_size=1, max_size=3),
+    st.booleans(),
+)
+@settings(max_examples=40)
+def test_a_warning_before_there_is_no_update_and_none_else(learning_starts, train_freq, n_envs, learns, pretrains):
+    env = DummyVecEnv([lambda: CounterEnv(6)] * n_envs)
+    reward = "disagreement" if pretrains else None
+    model = DrQv2(
+        "CnnPolicy", env, preset="tiny", intrinsic_reward=reward, train_freq=train_freq, learning_starts=learning_starts,
+        gradient_steps=1, device="cpu", seed=0,
+    )  # fmt: skip
+    for steps in learns:
+        before = model._n_updates
+        messages = told(model, steps)
+        assert len(messages) == (model._n_updates == before)
+        for message in messages:
+            if model.phase_timesteps <= learning_starts:
+                assert message.startswith("This learn() will hold no update") and f"={learning_starts}: more" in message
+            else:  # the very first update has no step to draw
+                assert message.startswith("learn() has ended without an update") and "waits for a first step" in message
+            assert f"after {model.phase_timesteps} agent steps of {model.phase}" in message
+
+
+def test_what_is_only_known_at_the_end(tiny_model):
+    model = tiny_model(CounterEnv(50), learning_starts=2)
+    [message] = told(model, 20)
+    assert message.startswith("learn() has ended without an update, after 20 agent steps") and "batch_length=" in message
+    assert told(model, 60) == []
+    episodes = tiny_model(CounterEnv(5), learning_starts=40, train_freq=(1, "episode"))
+    [message] = told(episodes, 10)
+    assert message.startswith("learn() has ended without an update") and "learning_starts=40" in message
+
+
+@pytest.mark.parametrize("reason", ["no steps", "no updates wanted", "ended by a callback"])
+def test_who_wants_none_is_left_in_peace(tiny_model, reason):
+    model = tiny_model(learning_starts=0, gradient_steps=0 if reason == "no updates wanted" else 1)
+    assert told(model, 0 if reason == "no steps" else 8, Stops() if reason.startswith("ended") else None) == []
