@@ -25,6 +25,7 @@ from sb3_dreamer_urlb.evaluation.episodes import SEED, Evaluation
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import oracle
 from sb3_dreamer_urlb.number_checks import check_positive
+from sb3_dreamer_urlb.words import counted
 
 #: frames of an episode, where the environment does not say
 EPISODE = 1000
@@ -144,7 +145,7 @@ def fitted(config: DemoConfig, env: gymnasium.Env, limit: float = LIMIT) -> Demo
         print(
             f"All of it would take {pace.in_words(seconds(1.0))}: on this machine {chosen.pretrain_frames} and "
             f"{chosen.finetune_frames} frames in place of {config.pretrain_frames} and {config.finetune_frames}, evaluated in "
-            f"{chosen.episodes} episode(s) in place of {config.episodes}. Give the numbers yourself for the whole."
+            f"{counted(chosen.episodes, 'episode')} in place of {config.episodes}. Give the numbers yourself for the whole."
         )
     print(f"Learning and playing will take {pace.in_words(seconds(share))}; pictures come on top.", flush=True)
     return chosen
@@ -208,10 +209,13 @@ def _report(config: DemoConfig, model: DreamerV2, env: gymnasium.Env, returns: l
 def _print_table(
     config: DemoConfig, result: dict[str, float], returns: list[float], random_returns: list[float], seconds: float
 ) -> None:
-    spread = {"fine-tuned agent": np.std(returns), "random policy": np.std(random_returns)}
-    print(f"\n{config.task}, seed {config.seed}: mean return of {config.episodes} episodes (± standard deviation)")
+    several = config.episodes > 1
+    spread = " (± standard deviation)" if several else ""
+    played = {"fine-tuned agent": returns, "random policy": random_returns}
+    spreads = {name: f"± {np.std(of):.0f}" if several else "" for name, of in played.items()}
+    print(f"\n{config.task}, seed {config.seed}: mean return of {counted(config.episodes, 'episode')}{spread}")
     for name, value in result.items():
-        note = f"± {spread[name]:.0f}" if name in spread else "Dreamer trained for 2M frames (paper, appendix A)"
+        note = spreads.get(name, "Dreamer trained for 2M frames (paper, appendix A)")
         print(f"  {name:<18}{value:>6.0f}  {note}")
     print(f"{seconds / 60:.1f} minutes. Written to {config.out}/:")
     for path in sorted(config.out.iterdir()):

@@ -23,6 +23,7 @@ from sb3_dreamer_urlb.evaluation.figures import check_plots_installed
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 from sb3_dreamer_urlb.number_checks import check_integer, check_positive
+from sb3_dreamer_urlb.words import counted, mean_and_spread
 
 #: the agent that ships: LBS on walker stand without its reward, 40 000 frames, seed 0
 SHIPPED = Path(__file__).with_name("data") / "walker-lbs.zip"
@@ -249,10 +250,11 @@ def _print_table(config: DemoConfig, agents: Mapping[str, Agent], random: Sequen
     print(f"{'':<34}{SCRATCH:>15}{PRETRAINED:>15}")
     means = [np.mean(demo_agents.episodes(agent.folder)) for agent in agents.values()]
     print(f"{'while learning':<34}" + "".join(f"{mean:>15.0f}" for mean in means))
+    played = counted(config.episodes, "episode")
     for planner, label in (("none", "actor"), ("dyna_mpc", "Dyna-MPC")):
         rows = [_scores(agent)[planner] for agent in agents.values()]
-        cells = "".join(f"{f'{row.return_mean:.0f} ± {row.return_std:.0f}':>15}" for row in rows)
-        print(f"{f'after learning, {config.episodes} episodes, {label}':<34}{cells}")
+        cells = "".join(f"{mean_and_spread(row.return_mean, row.return_std, row.episodes):>15}" for row in rows)
+        print(f"{f'after learning, {played}, {label}':<34}{cells}")
     print(f"{'random actions':<34}{np.mean(random):>15.0f}")
     print("One seed of each proves nothing: docs/results.md has them all, with intervals.")
     print(f"{seconds / 60:.1f} minutes. Written to {config.out}/:")

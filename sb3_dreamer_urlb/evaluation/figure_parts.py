@@ -11,6 +11,7 @@ from sb3_dreamer_urlb.evaluation.arms import Arm, Study
 from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M, URLB_EXPERT
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, bars, finish, frames_label, new_figure
+from sb3_dreamer_urlb.words import counted
 
 OVERALL = "overall"
 DOMAINS: dict[str, str | None] = {OVERALL: None, **{domain: domain for domain in URLB_TASKS}}
@@ -28,7 +29,7 @@ def seeds(arms: Sequence[Arm]) -> str:
     if not numbers:
         return "no runs"
     low, high = min(numbers), max(numbers)
-    return f"{low} seed{'s' if low > 1 else ''} a task" if low == high else f"{low} to {high} seeds a task"
+    return f"{counted(low, 'seed')} a task" if low == high else f"{low} to {high} seeds a task"
 
 
 def unscored(arms: Sequence[Arm]) -> str:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
+from sb3_dreamer_urlb.words import counted, mean_and_spread
+
 #: columns that say how an evaluation came about or what it cost; two rows that differ only here are about the same run
 DESCRIBING = frozenset(
     ("algorithm_version", "commit", "device", "evaluation_seed", "intrinsic_reward", "ldd", "machine", "note", "returns")
@@ -95,7 +97,8 @@ class Row:
 
     def __str__(self) -> str:
         own = ", ".join(f"{name}={text}" for name, text in self.key)
-        return f"{own}: return {self.return_mean:g} ± {self.return_std:g} of {self.episodes} episodes"
+        score = mean_and_spread(self.return_mean, self.return_std, self.episodes, "g")
+        return f"{own}: return {score} of {counted(self.episodes, 'episode')}"
 
 
 #: columns that every file has

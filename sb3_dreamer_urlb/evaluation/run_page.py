@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from sb3_dreamer_urlb.evaluation.run_facts import AGENT, RunFacts, Series, thinn
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score, published_returns
 from sb3_dreamer_urlb.evaluation.style import COLORS, RC, check_matplotlib_installed, frames_label
 from sb3_dreamer_urlb.version import how_to_install
+from sb3_dreamer_urlb.words import mean_and_spread
 
 TEMPLATES = Path(__file__).parent / "templates"
 #: headings → beginnings of the tags below them; a tag stands below the first that fits
@@ -100,7 +100,7 @@ def _evaluation(row: Any) -> dict[str, str]:
         "task": task,
         "frames": f"{frames_label(row.pretrain_frames)} + {frames_label(row.finetune_frames)}",
         "planner": row.planner,
-        "return": f"{row.return_mean:.0f}" + ("" if math.isnan(row.return_std) else f" ± {row.return_std:.0f}"),
+        "return": mean_and_spread(row.return_mean, row.return_std, row.episodes),
         "episodes": str(row.episodes),
         "score": f"{100 * normalized_score(task, row.return_mean):.1f} %" if known else "–",
         "oracle": f"{ORACLE[task]:.0f}" if known else "–",

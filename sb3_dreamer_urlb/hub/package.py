@@ -24,6 +24,7 @@ from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
+from sb3_dreamer_urlb.hub.facts import facts_about
 from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.snapshots import bounded_json
@@ -97,7 +98,7 @@ def package_to_hub(
             normalizer = unwrap_vec_normalize(env)
             if normalizer is not None:
                 save_vec_normalize(normalizer, folder / STATISTICS)
-            facts = cards.facts_about(model, env_id, command)
+            facts = facts_about(model, env_id, command, _spec_of(env))
             card = cards.model_card(model, facts, evaluation, repository.shown, normalizer is not None, filmed)
             (folder / CARD).write_text(card)
             (folder / CONFIG).write_text(json.dumps(cards.config(facts, model_file), indent=1))

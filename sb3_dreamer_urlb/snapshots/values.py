@@ -21,6 +21,8 @@ from sb3_dreamer_urlb.planning import CategoricalDynaMPC, DynaMPC, Planner, Plan
 
 TAG = "!"
 CUSTOM = "custom"
+#: tags of what a registry knows by its name
+BY_NAME = ("intrinsic", "registered planner")
 #: elements of an array or a space's bounds
 MAX_ELEMENTS = 1 << 20
 

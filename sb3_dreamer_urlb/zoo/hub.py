@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -17,8 +18,8 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.hub.model_card import without_private_paths
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
+from sb3_dreamer_urlb.hub.privacy import as_plain, plain_for_everybody
 from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 
@@ -198,22 +199,18 @@ def _zoo_files(run: Path, saved: dict[str, Any], env_kwargs: dict[str, Any], fol
     """What ``load_from_hub`` looks for, here as in rl_zoo3; as YAML that needs no Python types."""
     config = dict(yaml.load((run / CONFIG).read_text(), Loader=yaml.UnsafeLoader))
     shared = {name: saved[name] for name in SHARED_ARGUMENTS if name in saved}
-    for name, content in ((CONFIG, config), (ARGUMENTS, shared), (ENV_KWARGS, env_kwargs)):
-        (folder / name).write_text(yaml.safe_dump(_plain(content)))
+    for name, content in ((CONFIG, config), (ARGUMENTS, shared)):
+        (folder / name).write_text(yaml.safe_dump(plain_for_everybody(content)))
+    # The environment is made from these again: a folder that others have, too, must still be named in full.
+    needed = as_plain(env_kwargs)
+    if needed != plain_for_everybody(env_kwargs):
+        warnings.warn(f"{ENV_KWARGS} names folders, for the environment is made with them: {needed}. Others need them, too.")
+    (folder / ENV_KWARGS).write_text(yaml.safe_dump(needed))
     with zipfile.ZipFile(folder / METRICS, "w") as archive:
         for path in (run.parent / "evaluations.npz", *sorted(run.parent.glob("*.csv"))):
             if path.is_file():
                 archive.write(path, path.name)
     return {name: folder / name for name in (CONFIG, ARGUMENTS, ENV_KWARGS, METRICS)}
-
-
-def _plain(value: Any) -> Any:
-    """As YAML's own types, anything else as its text; without names of this machine's folders."""
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return value if value is None or isinstance(value, bool | int | float) else without_private_paths(str(value))
 
 
 def _read_yaml(path: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 from unittest import mock
 
+from sb3_dreamer_urlb.words import counted
 from sb3_dreamer_urlb.zoo.found_runs import check_there_are_runs
 from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line
 
@@ -40,11 +41,12 @@ def plot(arguments: list[str], prog: str) -> int:
         plot_train()
     few = {folder: count for folder, count in counts.items() if count < own.episode_window}
     for folder, count in few.items():
-        print(
-            f"{prog}: {folder} has {count} episodes, too few for a mean over {own.episode_window}: "
-            f"-w {max(count // 2, 1)} takes the mean over fewer",
-            file=sys.stderr,
-        )
+        if count == 0:
+            print(f"{prog}: {folder} has no episode that ended: there is nothing to draw", file=sys.stderr)
+        else:
+            enough = f"-w {max(count // 2, 1)} takes the mean over fewer"
+            has = f"{folder} has {counted(count, 'episode')}"
+            print(f"{prog}: {has}, too few for a mean over {own.episode_window}: {enough}", file=sys.stderr)
     if not counts:
         print(f"{prog}: no run with finished episodes was found", file=sys.stderr)
     return 2 if len(few) == len(counts) else 0

@@ -26,11 +26,16 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_dreamer_urlb
-from sb3_dreamer_urlb import DreamerV2, DrQv2, SnapshotError
+from sb3_dreamer_urlb import DreamerV2, DrQv2, SnapshotError, register_intrinsic_reward, register_planner
 from sb3_dreamer_urlb.hub import load_from_hub, load_vec_normalize, package_to_hub, push_to_hub, save_vec_normalize
 from sb3_dreamer_urlb.hub import package as packaging
-from sb3_dreamer_urlb.hub.model_card import who_registers, without_private_paths
+from sb3_dreamer_urlb.hub.privacy import without_private_paths
 from sb3_dreamer_urlb.hub.repositories import FolderRepository, HubRepository, check_filename, open_repository
+from sb3_dreamer_urlb.hub.usage import who_registers
+from sb3_dreamer_urlb.intrinsic import registry as methods
+from sb3_dreamer_urlb.intrinsic.random_actions import RandomActions
+from sb3_dreamer_urlb.planning import DynaMPC
+from sb3_dreamer_urlb.planning import registry as planners
 
 ID, VECTORS = "test/Counter-v0", "test/Vectors-v0"
 COMMAND = "python -m sb3_dreamer_urlb.zoo train --algo dreamerv2 --env test/Counter-v0 --seed 3"
@@ -91,7 +96,7 @@ def test_the_card_says_what_a_reader_wants_to_know(model, tmp_path):
         "| frames | 40 of pre-training, then 24 on the task, 2 frames an agent step |",
         "| planner | `dyna_mpc` |",
         "| seed | 3 |",
-        "| return | 4.50 +/- 0.00 (mean and standard deviation of 1 deterministic episodes) |",
+        "| return | 4.50 +/- 0.00 (mean and standard deviation of 1 deterministic episode) |",
         f"```sh\n{COMMAND}\n```",
         f"sb3_dreamer_urlb {sb3_dreamer_urlb.__version__}",
         '"policy": "CnnPolicy"',
@@ -477,6 +482,76 @@ def test_the_card_says_what_an_environment_needs_that_no_package_registers(tiny_
     text = card(tmp_path).text
     assert "No package registers this environment" in text and 'gymnasium.make("my env")' not in text
     assert "2/2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["images", "normalised vectors"])
+def test_the_cards_code_makes_the_environment_with_the_same_arguments(tiny_model, tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    told = {"length": 5, "max_episode_steps": 3, "domain": "quadruped"}
+    if kind == "images":
+        model, shown = tiny_model(gymnasium.make(ID, **told)), "with `length=5, domain='quadruped', max_episode_steps=3`"
+    else:
+        del told["domain"]
+        env = VecNormalize(make_vec_env(VECTORS, env_kwargs=told))
+        model, shown = tiny_model(env, "MlpPolicy"), "with `length=5, max_episode_steps=3`"
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
+    [code] = re.findall(r"```python\n(.*?)```", card(tmp_path).text, re.DOTALL)
+    names: dict = {}
+    exec(code.replace("model.fine_tune()", "").replace("model.learn(50_000)", ""), names)
+    spec = names["env"].spec if kind == "images" else names["env"].get_attr("spec")[0]
+    assert {name: spec.kwargs.get(name, spec.max_episode_steps) for name in told} == told
+    assert shown in card(tmp_path).text
+    assert json.loads((tmp_path / "config.json").read_text())["env_kwargs"] == told
+
+
+def test_a_usual_environment_needs_no_arguments(model, tmp_path):
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
+    assert 'env = gymnasium.make("test/Counter-v0")\n' in card(tmp_path).text
+
+
+class OwnPlanner(DynaMPC):
+    """A planner of somebody's own."""
+
+
+class OwnReward(RandomActions):
+    """A method of somebody's own."""
+
+
+@pytest.fixture
+def registries(monkeypatch):
+    """What one test registers is gone after it."""
+    for module, name in ((planners, "_KINDS"), (planners, "PLANNERS"), (methods, "_REGISTRY")):
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
+
+
+@pytest.mark.parametrize("by_name", [True, False])
+@pytest.mark.filterwarnings("ignore:No file can hold")
+def test_the_card_says_what_of_its_makers_own_is_needed(registries, tiny_model, tmp_path, by_name):
+    if by_name:
+        register_planner("own", OwnPlanner)
+        register_intrinsic_reward("own reward", OwnReward)
+    model = tiny_model(gymnasium.make(ID), planner=OwnPlanner, intrinsic_reward=OwnReward)
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
+    text, parts = card(tmp_path).text, json.loads((tmp_path / "config.json").read_text())["own_parts"]
+    hows = {
+        "planner": 'register_planner("own", OwnPlanner) first, or load(..., planner="dyna_mpc").',
+        "intrinsic_reward": 'register_intrinsic_reward("own reward", OwnReward) first.',
+    }
+    if not by_name:
+        hows = {
+            "planner": 'load(..., custom_objects={"planner": OwnPlanner}), or load(..., planner="dyna_mpc").',
+            "intrinsic_reward": 'load(..., custom_objects={"intrinsic_reward": OwnReward}).',
+        }
+    for argument, kind in (("planner", OwnPlanner), ("intrinsic_reward", OwnReward)):
+        named = f"{kind.__module__}.{kind.__qualname__}"
+        assert f"# Its {argument} is {named}, which this package does not have:\n# {hows[argument]}\n" in text
+        assert parts[argument]["kind"] == named
+
+
+def test_what_the_package_has_needs_nothing(model, tmp_path):
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
+    assert "does not have" not in card(tmp_path).text
+    assert json.loads((tmp_path / "config.json").read_text())["own_parts"] == {}
 
 
 def test_the_card_imports_who_registers_the_environment():

@@ -32,7 +32,7 @@ from zoo_commands import CHEAP, CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, m
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
-from sb3_dreamer_urlb.hub.model_card import without_private_paths
+from sb3_dreamer_urlb.hub.privacy import without_private_paths
 from sb3_dreamer_urlb.zoo import configs, pretraining, registration
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
@@ -407,6 +407,9 @@ def test_plot_says_when_episodes_are_too_few(zoo, capsys, monkeypatch):
     assert "has 6 episodes, too few for a mean over 100: -w 3 takes the mean over fewer" in error
     assert main([*plot, "-w", "3"]) == 0 and Path("curve.png").exists()
     assert capsys.readouterr().err == ""
+    (folder / "0.monitor.csv").write_text('#{"t_start": 0.0, "env_id": "x"}\nr,l,t\n')
+    assert main([*plot, "-w", "1"]) == 2
+    assert "has no episode that ended: there is nothing to draw" in capsys.readouterr().err
     plt.close("all")
 
 
@@ -498,11 +501,14 @@ def test_what_is_shared_names_no_folder_of_this_machine(tmp_path):
         (tmp_path / name).write_text(yaml.dump({"replay_buffer_kwargs": here, "env_kwargs": here, "seed": 1}))
     out = tmp_path / "out"
     out.mkdir()
-    files = zoo_hub._zoo_files(tmp_path, zoo_hub._saved_arguments(tmp_path), here, out)
+    with pytest.warns(UserWarning, match="env_kwargs.yml names folders, .*/home/me/replays/walker"):
+        files = zoo_hub._zoo_files(tmp_path, zoo_hub._saved_arguments(tmp_path), here, out)
     plain = {"directory": "walker", "many": ["x", "urlb/walker-run-v0", 3]}
     assert yaml.safe_load(files["config.yml"].read_text())["replay_buffer_kwargs"] == plain
     assert yaml.safe_load(files["args.yml"].read_text()) == {"env_kwargs": plain, "seed": 1}
-    assert yaml.safe_load(files["env_kwargs.yml"].read_text()) == plain
+    # But where the environment is made from: there it would no longer be the same.
+    needed = {"directory": "/home/me/replays/walker", "many": ["/data/me/x", "urlb/walker-run-v0", 3]}
+    assert yaml.safe_load(files["env_kwargs.yml"].read_text()) == needed
 
 
 def test_a_run_is_shared_and_played_elsewhere(zoo, capsys):

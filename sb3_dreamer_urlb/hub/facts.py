@@ -1,0 +1,134 @@
+"""What a model knows about itself, for its card and for programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
+from sb3_dreamer_urlb.hub.algorithms import algorithm_of
+from sb3_dreamer_urlb.hub.privacy import plain_for_everybody, without_private_paths
+from sb3_dreamer_urlb.intrinsic import ExplorationMethod, registered_intrinsic_rewards
+from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.planning import planner_name, registered_planners
+from sb3_dreamer_urlb.snapshots import values
+from sb3_dreamer_urlb.snapshots.model_data import describe, needed
+
+FROM_SCRATCH = "none, learnt from scratch"
+
+
+@dataclass(frozen=True)
+class OwnPart:
+    """What this package does not have, and a model learnt with.
+
+    :param kind: its class
+    :param registered_as: the name it goes by in the model's file; None where no file can hold it
+    """
+
+    kind: str
+    registered_as: str | None
+
+
+@dataclass(frozen=True)
+class ModelFacts:
+    """What the card states, and ``config.json`` in a form for programs.
+
+    :param env_id: of the environment that it was evaluated in
+    :param domain: of the task, None where the environment does not tell
+    :param method: of exploration in pre-training
+    :param phase: that the model is in
+    :param pretrained_frames: environment frames of the pre-training, None where the snapshot is too old to know
+    :param frames: environment frames of the present phase
+    :param action_repeat: frames an agent step
+    :param planner: that acts in fine-tuning, or None
+    :param seed: None for a run without
+    :param command: that made it, None if nobody said
+    :param algorithm: name of its class
+    :param env_kwargs: what ``gymnasium.make`` was told beside the id, as JSON
+    :param own_parts: by constructor argument, a planner of one's own, say
+    """
+
+    env_id: str
+    domain: str | None
+    method: str
+    phase: str
+    pretrained_frames: int | None
+    frames: int
+    action_repeat: int
+    planner: str | None
+    seed: int | None
+    command: str | None
+    algorithm: str
+    env_kwargs: dict[str, Any]
+    own_parts: dict[str, OwnPart]
+
+
+def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, spec: EnvSpec | None = None) -> ModelFacts:
+    """What a model knows about itself.
+
+    :param model: trained
+    :param env_id: of the environment that it was evaluated in
+    :param command: that made it
+    :param spec: that the environment was made by
+    """
+    reward = model.intrinsic_reward
+    name = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
+    exploring = model.phase == PRETRAINING
+    known = exploring or reward is None or model.pretrained_frames > 0
+    return ModelFacts(
+        env_id=env_id,
+        domain=model.domain,
+        method=FROM_SCRATCH if reward is None else name,
+        phase=model.phase,
+        pretrained_frames=(model.phase_frames if exploring else model.pretrained_frames) if known else None,
+        frames=model.phase_frames,
+        action_repeat=model.action_repeat,
+        planner=planner_name(getattr(model, "planner", None)),
+        seed=model.seed,
+        command=None if command is None else without_private_paths(command),
+        algorithm=algorithm_of(model).name,
+        env_kwargs={} if spec is None or spec.id != env_id else environment_arguments(spec),
+        own_parts=own_parts(model),
+    )
+
+
+def environment_arguments(spec: EnvSpec) -> dict[str, Any]:
+    """What somebody else must tell ``gymnasium.make`` beside the id; not how to draw it.
+
+    :param spec: of the environment
+    :return: as JSON
+    """
+    registered = gymnasium.registry.get(spec.id)
+    usual = {} if registered is None else registered.kwargs
+    given = {name: values.encode_or_describe(value) for name, value in spec.kwargs.items() if name != "render_mode"}
+    changed = {n: value for n, value in given.items() if n not in usual or value != values.encode_or_describe(usual[n])}
+    found: dict[str, Any] = plain_for_everybody(changed)
+    if registered is not None and spec.max_episode_steps != registered.max_episode_steps:
+        found["max_episode_steps"] = spec.max_episode_steps
+    return found
+
+
+def own_parts(model: AgentAlgorithm) -> dict[str, OwnPart]:
+    """By argument, what another machine has not, and needs to load the model.
+
+    :param model: any
+    """
+    data = describe(model, None)
+    stored = {"policy": data["policy"], **data["arguments"]}
+    customs = {name: values.contains_custom(values.decode(stored[name])) for name in needed(data) if name in stored}
+    found = {name: OwnPart(custom.description, None) for name, custom in customs.items() if custom is not None}
+    kinds: dict[str, dict[str, tuple[type, ...]]] = {
+        "planner": {**registered_planners()},
+        "intrinsic_reward": {name: (kind,) for name, kind in registered_intrinsic_rewards(ExplorationMethod).items()},
+    }
+    for name, registered in kinds.items():
+        given = getattr(model, name, None)
+        kind = given if isinstance(given, type) else type(given)
+        known_as = given if isinstance(given, str) else next((n for n, classes in registered.items() if kind in classes), None)
+        for one in registered.get(known_as or "", ())[:1] if name not in found else ():
+            if not one.__module__.startswith("sb3_dreamer_urlb."):
+                found[name] = OwnPart(f"{one.__module__}.{one.__qualname__}", known_as)
+    return found
