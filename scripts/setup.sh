@@ -79,7 +79,7 @@ install_torch() {
 
 install_packages() {
     local pip=("$venv/bin/python" -m pip --disable-pip-version-check)
-    say "installing the pinned packages (some 2 GB on the disk; three to five minutes the first time)"
+    say "installing the pinned packages (some 2.6 GB on the disk with torch for CPUs; three to five minutes the first time)"
     [[ -z ${TORCH_INDEX:-} ]] || install_torch
     if [[ -z ${TORCH_INDEX:-} && $(uname -s) == Linux ]] && ! command -v nvidia-smi >/dev/null &&
         ! "${pip[@]}" install -qq --dry-run --no-index --no-deps -c constraints.txt torch 2>/dev/null; then
