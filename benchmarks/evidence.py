@@ -29,7 +29,7 @@ import evidence_study as study
 import gymnasium
 import numpy as np
 import torch as th
-from evidence_study import ARMS, BODIES, PRIMAL, REPEAT, Run, Setting, snapshot_of
+from evidence_study import ARMS, BODIES, PRIMAL, REPEAT, Arm, Run, Setting, snapshot_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -100,19 +100,19 @@ class Episodes(BaseCallback):
 def begin(run: Run, folder: Path) -> DreamerV2:
     """A model at the beginning of its run, or where the run was left."""
     setting = run.setting
-    method, keep_actor = ARMS[run.arm] if run.task else (run.arm, False)
+    arm = ARMS[run.arm] if run.task else Arm(run.arm)
     source = None if run.needs is None else snapshot_of(run.needs)
     env = make_env(setting, run.task or PRIMAL[run.body], run.seed if not run.task else 1000 + run.seed, source)
     left = DreamerV2.resume(folder, env, device=setting.device)
     if left is not None:
         return left
     if source is not None:
-        model = DreamerV2.load(source, env=env, device=setting.device)
-        model.fine_tune(keep_actor=keep_actor)
+        model = DreamerV2.load(source, env=env, device=setting.device, **arm.changes)
+        model.fine_tune(keep_actor=arm.keeps_actor)
         model.num_timesteps = 0
         return model
     kwargs: dict[str, Any] = {"preset": setting.preset, "seed": run.seed, "device": setting.device, **setting.further}
-    return DreamerV2(setting.policy, env, intrinsic_reward=method, **kwargs)
+    return DreamerV2(setting.policy, env, intrinsic_reward=arm.method, **kwargs)
 
 
 def do(run: Run) -> None:
@@ -149,7 +149,7 @@ def score(run: Run, model: DreamerV2, folder: Path) -> None:
     """Ten episodes with the actor alone and ten with Dyna-MPC, each from a start of its own and all at once, as rows."""
     setting, final = run.setting, folder / "final.zip"
     keep(model, final)
-    method, keep_actor = ARMS[run.arm]
+    arm = ARMS[run.arm]
     rows = []
     for planner in (None, "dyna_mpc"):
         unseen = make_env(setting, run.task, EVALUATION_SEED + EPISODES * run.seed, final, False, EPISODES)
@@ -158,14 +158,14 @@ def score(run: Run, model: DreamerV2, folder: Path) -> None:
         returns, _ = evaluate_policy(agent, unseen, EPISODES, return_episode_rewards=True)
         rows.append(
             Row(
-                method=method or "dreamer",
+                method=arm.method or "dreamer",
                 domain=run.body,
                 task=run.task,
                 seed=run.seed,
-                pretrain_frames=0 if method is None else setting.pretraining * REPEAT,
+                pretrain_frames=0 if arm.method is None else setting.pretraining * REPEAT,
                 finetune_frames=setting.finetuning * REPEAT,
-                keep_actor=None if method is None else keep_actor,
-                keep_critic=None if method is None else False,
+                keep_actor=None if arm.method is None else arm.keeps_actor,
+                keep_critic=None if arm.method is None else False,
                 planner=planner or "none",
                 preset=setting.preset,
                 return_mean=float(np.mean(returns)),

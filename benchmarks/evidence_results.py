@@ -31,6 +31,15 @@ LABELS = {
     "lbs-fresh": "LBS, fresh actor",
     "random-fresh": "random actions, fresh actor",
     "plan2explore-kept": "Plan2Explore, actor kept",
+    **{
+        f"lbs-kept-{name}": f"LBS, actor kept, {changed}"
+        for name, changed in {
+            "target-2": "target critic every 2 updates",
+            "target-50": "target critic every 50 updates",
+            "rate-2e-4": "model's rate 2e-4",
+            "start-2500": "updates from step 2500 on",
+        }.items()
+    },
 }
 #: of a normal distribution: two-sided 5 % error, 80 % power
 _QUANTILES = 1.96 + 0.84
@@ -123,7 +132,7 @@ def draw(path: Path) -> None:
     for axes, (task, arms) in zip(panels, tasks.items(), strict=True):
         for i, (arm, label) in enumerate(LABELS.items()):
             runs = arms.get(arm, [])
-            if len(runs) < 2:
+            if len(runs) < 2 or study.ARMS[arm].changes:
                 continue
             length = min(map(len, runs))
             points = [iqm({task: [run[at] for run in runs]}, FIGURE_REPETITIONS) for at in range(length)]

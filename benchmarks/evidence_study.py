@@ -18,13 +18,33 @@ PRIMAL = {"walker": "stand", "finger": "spin"}
 BODIES = {"spin": "finger"}
 #: agent steps; an episode has 500
 REPEAT, EPISODE = 2, 500
-#: name of an arm → intrinsic reward of its pre-training (None: from scratch), and whether the actor is kept
-ARMS: dict[str, tuple[str | None, bool]] = {
-    "scratch": (None, False),
-    "lbs-kept": ("lbs", True),
-    "lbs-fresh": ("lbs", False),
-    "random-fresh": ("random", False),
-    "plan2explore-kept": ("plan2explore", True),
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How agents come to a task.
+
+    :param method: intrinsic reward of the pre-training; None: from scratch
+    :param keeps_actor: into the fine-tuning
+    :param changes: arguments that the fine-tuning has otherwise than the pre-training
+    """
+
+    method: str | None
+    keeps_actor: bool = False
+    changes: dict[str, Any] = field(default_factory=dict)
+
+
+ARMS = {
+    "scratch": Arm(None),
+    "lbs-kept": Arm("lbs", True),
+    "lbs-fresh": Arm("lbs"),
+    "random-fresh": Arm("random"),
+    "plan2explore-kept": Arm("plan2explore", True),
+    # What else may help or hide it: how soon the new critic's target follows; how fast the model is retrained, on how much.
+    "lbs-kept-target-2": Arm("lbs", True, {"target_update_interval": 2}),
+    "lbs-kept-target-50": Arm("lbs", True, {"target_update_interval": 50}),
+    "lbs-kept-rate-2e-4": Arm("lbs", True, {"learning_rate": 2e-4}),
+    "lbs-kept-start-2500": Arm("lbs", True, {"learning_starts": 2500}),
 }
 
 
@@ -78,6 +98,7 @@ STUDY: dict[str, tuple[Tier, ...]] = {
         (("lbs-kept", "scratch"), ("spin",), 3),
         (("lbs-kept", "scratch"), ("run", "flip"), 10),
         (("random-fresh", "lbs-fresh"), ("run", "flip"), 3),
+        (tuple(arm for arm in ARMS if ARMS[arm].changes), ("flip",), 3),
         (("lbs-kept", "scratch"), ("spin",), 10),
         (("random-fresh", "lbs-fresh", "plan2explore-kept"), ("run", "flip", "spin"), 10),
     ),
@@ -124,8 +145,8 @@ class Run:
     @property
     def needs(self) -> Run | None:
         """The pre-training that it starts from."""
-        method, _ = ARMS.get(self.arm, (None, False))
-        return Run(method, "", self.seed, self.body, self.size) if self.task and method is not None else None
+        method = ARMS[self.arm].method if self.task else None
+        return Run(method, "", self.seed, self.body, self.size) if method is not None else None
 
 
 def prefix(size: str) -> str:

@@ -89,6 +89,17 @@ def test_runs_from_pixels_have_their_own_names_and_no_statistics(study, evidence
     assert (tuned.phase, tuned.num_timesteps) == ("finetuning", 0)
 
 
+def test_what_an_arm_changes_is_changed_for_the_task_only(study, evidence, results, tmp_path):
+    assert set(results.LABELS) == set(study.ARMS)
+    run = study.Run("lbs-kept-target-2", "run", 0)
+    pretraining = evidence.begin(run.needs, tmp_path)
+    evidence.keep(pretraining, study.snapshot_of(run.needs))
+    tuned = evidence.begin(run, tmp_path)
+    plain = evidence.begin(study.Run("lbs-kept", "run", 0), tmp_path)
+    assert (tuned.target_update_interval, tuned.kept["actor"]) == (2, True)
+    assert pretraining.target_update_interval == plain.target_update_interval != 2
+
+
 def test_scores_from_pixels_stand_apart(study, evidence, results):
     for size in study.SETTINGS:
         evidence.record(study.Run("scratch", "run", 0, size=size), [(500, 1.0)])
