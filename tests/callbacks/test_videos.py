@@ -221,7 +221,7 @@ def test_numbers_that_make_no_sense(name):
 
 
 def test_an_id_and_other_callbacks_and_several_calls(tiny_model, tmp_path):
-    model = tiny_model(gymnasium.make(ID), tensorboard_log=str(tmp_path))
+    model = tiny_model(gymnasium.make(ID), tensorboard_log=str(tmp_path), gradient_steps=0)
     callback = VideoCallback(ID, video_freq=10, video_length=3)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
