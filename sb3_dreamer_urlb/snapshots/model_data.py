@@ -161,7 +161,9 @@ def check_whose(algorithm: type[SavedAlgorithm], data: dict[str, Any]) -> None:
     unknown = sorted(stored - set(algorithm.argument_names()))
     if not unknown:
         return
-    its = next((kind.__name__ for kind in public_algorithms() if stored <= set(kind.argument_names())), None)
+    # What has all of this class's arguments is no other algorithm's: none is imported for a message about a damaged file.
+    others = [] if stored.issuperset(algorithm.argument_names()) else public_algorithms()
+    its = next((kind.__name__ for kind in others if stored <= set(kind.argument_names())), None)
     if its is not None:
         raise ValueError(f"it holds a model of {its}, not of {me}: {its}.load reads it")
     raise ValueError(f"it has an argument {unknown[0]!r}, which {me} has not: the load of the class that saved it reads it")

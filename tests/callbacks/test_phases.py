@@ -167,8 +167,8 @@ def test_pretraining_never_plans_and_its_rewards_do_not_reach_the_agent(tiny_mod
 def test_fine_tuning_twice_or_from_scratch_is_refused(pretrained, tiny_model):
     model = pretrained()
     model.fine_tune()
-    for its in (model, tiny_model()):
-        with pytest.raises(ValueError, match=r"'pretraining'.*'finetuning'"):
+    for its, message in ((model, r"'pretraining'.*'finetuning'"), (tiny_model(), "never pre-trained")):
+        with pytest.raises(ValueError, match=message):
             its.fine_tune()
 
 
