@@ -24,7 +24,7 @@ def without_cuda(monkeypatch):
 def test_a_device_that_is_not_here(algorithm, device, tmp_path):
     message = f"device='{device}': torch .* finds no such device here, cpu is used"
     with pytest.warns(UserWarning, match=message) as told:
-        model = algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device=device)
+        model = algorithm("CnnPolicy", CounterEnv(9), preset="tiny", device=device)
     assert model.device == th.device("cpu") and len([one for one in told if "device=" in str(one.message)]) == 1
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
@@ -39,7 +39,7 @@ def test_a_device_that_is_not_here(algorithm, device, tmp_path):
 def test_a_device_that_is_here(algorithm, device):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device=device)
+        algorithm("CnnPolicy", CounterEnv(9), preset="tiny", device=device)
 
 
 @pytest.mark.parametrize(
@@ -64,11 +64,11 @@ def test_a_device_that_torch_does_not_know(device, hint):
 
 @ALGORITHMS
 def test_it_is_refused_wherever_a_device_is_taken(algorithm, tmp_path):
-    model = algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device="cpu")
+    model = algorithm("CnnPolicy", CounterEnv(9), preset="tiny", device="cpu")
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
     for take in (
-        lambda: algorithm("MlpPolicy", CounterEnv(9), preset="tiny", device="gpu"),
+        lambda: algorithm("CnnPolicy", CounterEnv(9), preset="tiny", device="gpu"),
         lambda: algorithm.load(tmp_path / "model", device="gpu"),
         lambda: type(model.policy).load(tmp_path / "policy", device="gpu"),
         lambda: setattr(model, "device", "gpu"),

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 
+from sb3_dreamer_urlb.algorithm import advice
 from sb3_dreamer_urlb.algorithm.checks import check_scheduled_rate
 from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.policy import AgentPolicy, Memory
@@ -29,6 +31,8 @@ class AgentAlgorithm(PhasedAlgorithm):
     """
 
     policy: AgentPolicy[Any]
+    #: what its presets are made for, see :func:`~sb3_dreamer_urlb.algorithm.advice.warn_of_preset`
+    presets_made_for: ClassVar[Mapping[str, Collection[str]]] = MappingProxyType({})
     #: how updates run, one of ``graphs.COMPILE``
     compile: str
     learner: BaseLearner[Any, Any]
@@ -40,6 +44,11 @@ class AgentAlgorithm(PhasedAlgorithm):
     @abstractmethod
     def _new_learner(self) -> BaseLearner[Any, Any]:
         """What trains ``policy``, in the current phase."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if "policy" in vars(self):
+            advice.warn_of_preset(self.preset, self.presets_made_for, self.policy.observations.has_images)
 
     def _build(self) -> None:
         if getattr(self, "replay_buffer", None) is None:

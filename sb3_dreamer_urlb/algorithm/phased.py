@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases, transfer_rule
-from sb3_dreamer_urlb.algorithm import checks, left_environments, normalized, training_loop
+from sb3_dreamer_urlb.algorithm import advice, checks, left_environments, normalized, training_loop
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.algorithm.environment_checks import check_env, needed_env
@@ -221,6 +221,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
             watch_ends(self._vec_normalize_env)
         self.action_repeat = env_fact(self.env, "action_repeat", 1)
         self.domain = env_fact(self.env, "domain", None)
+        advice.warn_if_no_episode_fits(self)
 
     # -- phases --------------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, kept_parts
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
-from sb3_dreamer_urlb.dreamer_v2.presets import get_preset, with_preset
+from sb3_dreamer_urlb.dreamer_v2.presets import MADE_FOR, get_preset, with_preset
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
@@ -110,7 +110,8 @@ class DreamerV2(AgentAlgorithm):
         ``"cuda_graphs"``, recorded once and launched as a whole; ``"auto"``: CUDA graphs on CUDA, native on CPUs where that
         can be had. What cannot be recorded or built runs eager, after a warning that says why; a compiler that is missing is
         worth a warning with ``"native"`` only
-    :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one) or ``"tiny"`` (tests);
+    :param preset: ``"paper"``, ``"small"`` (pixels on two CPU cores), ``"vector"`` (vectors on one), ``"state"``
+        and ``"state-small"`` (dm_control's states, the latter on one core), or ``"tiny"`` (tests);
         replaces defaults, never what you write
     :param _init_setup_model: build the networks now
     :raises ValueError: for arguments or spaces that do not fit, before anything is built
@@ -125,6 +126,7 @@ class DreamerV2(AgentAlgorithm):
     assignable = arguments.ASSIGNABLE
     of_the_networks = arguments.OF_THE_NETWORKS
     before_fine_tuning = arguments.BEFORE_FINE_TUNING
+    presets_made_for = MADE_FOR
     policy: DreamerPolicy
     learner: Learner
     intrinsic_reward: str | type[IntrinsicReward] | IntrinsicReward | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sb3_dreamer_urlb.algorithm.advice import IMAGES, VECTORS
 from sb3_dreamer_urlb.algorithm.presets import Presets, with_presets
 
 PRESETS: Presets = {
@@ -33,5 +34,7 @@ PRESETS: Presets = {
         "policy_kwargs": {"cnn_depth": 2, "feature_size": 4, "net_arch": [8]},
     },
 }
+#: the others serve everything; docs/notes/results.md says what "small" learns of vectors
+MADE_FOR = {"small": (IMAGES,), "vector": (VECTORS,)}
 #: fills a preset's hyperparameters in where a caller of the constructor left them out
 with_preset = with_presets(PRESETS)

@@ -19,7 +19,7 @@ from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import OnItsWay
 from sb3_dreamer_urlb.replay.rows import observation_of
 from sb3_dreamer_urlb.replay.sampling import BY_ROW, Pieces
-from sb3_dreamer_urlb.replay.sequence_buffer import SequenceReplayBuffer
+from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS, SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.windows import draw_windows
 from sb3_dreamer_urlb.types import Observation, StepBatch, map_observation
 
@@ -58,7 +58,7 @@ class NStepFrameReplayBuffer(SequenceReplayBuffer):
         frame_stack: int = 3,
         n_steps: int = 3,
         gamma: float = 0.99,
-        max_episode_rows: int = 5000,
+        max_episode_rows: int = MAX_EPISODE_ROWS,
         **kwargs: Any,
     ):
         length = frame_stack + n_steps

@@ -39,6 +39,10 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.replay.lmdb_store import LmdbStore
 
 
+#: longer episodes are stored in pieces, where nobody says otherwise
+MAX_EPISODE_ROWS = 5000
+
+
 def _zeros(space: spaces.Space[Any]) -> np.ndarray:
     assert space.shape is not None
     return np.zeros(space.shape, space.dtype)
@@ -84,7 +88,7 @@ class SequenceReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         *,
         batch_length: int,
-        max_episode_rows: int = 5000,
+        max_episode_rows: int = MAX_EPISODE_ROWS,
         seed: int | None = None,
         phase: str = "",
         skill_size: int = 0,

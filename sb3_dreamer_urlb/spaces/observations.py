@@ -23,6 +23,8 @@ from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.spaces.raw import Observation
 
 IMAGE_SIZES = (16, 512)
+#: of the policy, for images that are floats
+FLOAT_IMAGES = {"normalize_images": False}
 
 
 class Observations(ABC):
@@ -30,6 +32,8 @@ class Observations(ABC):
 
     #: of spaces that may be meant otherwise, sentences for a warning
     doubts: Sequence[str] = ()
+    #: whether there are pictures among them
+    has_images = False
 
     @abstractmethod
     def preprocess(self, raw: Observation) -> Observation:
@@ -57,6 +61,8 @@ class Images(Observations):
     :param normalize_images: as everywhere in SB3: False for images that are floats already
     :raises UnsupportedSpaceError: if it is something else, or has a size the networks do not take
     """
+
+    has_images = True
 
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Box) or not is_image_space(space, normalized_image=not normalize_images):
@@ -138,6 +144,11 @@ class Numbers(Vectors):
         if self.size == 0:
             raise UnsupportedSpaceError(f"The observation space holds no number: {space}.")
         self.scale = 255.0 if normalize_images and is_image_space(space) else 1.0
+        for kwargs in ({}, FLOAT_IMAGES):
+            if _is_image(space, **kwargs):
+                how = f" and policy_kwargs={kwargs}" if kwargs else ""
+                self.doubts = [f'{_not_as_image("The observation", space)} Use "CnnPolicy"{how} for images.']
+                break
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, th.Tensor)
@@ -192,6 +203,19 @@ def vectors(space: spaces.Space[Any], normalize_images: bool = True) -> Vectors:
     raise UnsupportedSpaceError(f"MlpPolicy needs one of the observation spaces {names}, got {space}.")
 
 
+def _is_image(space: spaces.Space[Any], normalize_images: bool = True) -> bool:
+    """Whether ``CnnPolicy`` takes it."""
+    try:
+        Images(space, normalize_images)
+    except UnsupportedSpaceError:
+        return False
+    return True
+
+
+def _not_as_image(what: str, space: spaces.Space[Any]) -> str:
+    return f"{what} is seen as a vector of {int(np.prod(space.shape or ()))} numbers, not as an image: {space}."
+
+
 def _may_be_meant_as_image(space: spaces.Space[Any]) -> bool:
     """Pixels in a shape that Stable-Baselines3 takes for no image, or numbers in an image's shape."""
     if not isinstance(space, spaces.Box):
@@ -212,21 +236,23 @@ class DictObservations(Observations):
 
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Dict) or len(space.spaces) == 0:
-            raise UnsupportedSpaceError(f"MultiInputPolicy needs a Dict of observations, got {space}.")
+            raise UnsupportedSpaceError(
+                f'MultiInputPolicy needs a Dict of observations, got {space}. Use "CnnPolicy" for images, "MlpPolicy" for vectors.'
+            )
         self.parts: dict[str, Observations] = {}
         self.doubts = doubts = []
         for key, part in space.spaces.items():
             image = is_image_space(part, normalized_image=not normalize_images)
             if not image and _may_be_meant_as_image(part):
                 doubts.append(
-                    f"Observation {key!r} is seen as a vector of {int(np.prod(part.shape or ()))} numbers, not as an image: "
-                    f"{part}. Images are Box(0, 255, (height, width, channels), uint8), or floats, channels first, with "
-                    'policy_kwargs={"normalize_images": False}.'
+                    f"{_not_as_image(f'Observation {key!r}', part)} Images are Box(0, 255, (height, width, channels), uint8), "
+                    f"or floats, channels first, with policy_kwargs={FLOAT_IMAGES}."
                 )
             try:
                 self.parts[key] = Images(part, normalize_images) if image else vectors(part, normalize_images)
             except UnsupportedSpaceError as error:
                 raise UnsupportedSpaceError(f"Observation {key!r}: {error}") from error
+        self.has_images = any(part.has_images for part in self.parts.values())
 
     def preprocess(self, raw: Observation) -> Observation:
         assert isinstance(raw, dict)

@@ -1,0 +1,43 @@
+"""What works, and is most likely not meant: warnings when a model is made or given an environment."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from sb3_dreamer_urlb.envs.facts import steps_an_episode
+from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS
+
+#: what presets are made for
+IMAGES, VECTORS = "images", "vectors"
+
+
+def warn_if_no_episode_fits(model: Any) -> None:
+    """Where the replay is smaller than an episode, it never holds more than a piece of one.
+
+    :param model: with its arguments and its environments
+    """
+    steps = steps_an_episode(model.env)
+    pieces = model.replay_buffer_kwargs.get("max_episode_rows", MAX_EPISODE_ROWS)
+    # An episode has one row more than steps: the reset's.
+    if steps is not None and min(steps + 1, pieces) > model.buffer_size:
+        warnings.warn(
+            f"buffer_size={model.buffer_size} holds no whole episode, only the last rows of one: the environment's have up to "
+            f"{steps} steps, which are {steps + 1} rows."
+        )
+
+
+def warn_of_preset(preset: str, made_for: Mapping[str, Collection[str]], sees_images: bool) -> None:
+    """Where a preset's numbers were found for something else than the agent sees.
+
+    :param preset: its name
+    :param made_for: names of presets, and what each is made for; those for everything are not among them
+    :param sees_images: whether the agent does
+    """
+    seen = IMAGES if sees_images else VECTORS
+    if seen not in made_for.get(preset, (seen,)):
+        others = ", ".join(repr(name) for name, what in made_for.items() if seen in what)
+        warnings.warn(
+            f"preset={preset!r} is made for {' and '.join(made_for[preset])}, and this agent sees {seen}. Made for {seen}: {others}."
+        )
