@@ -39,5 +39,6 @@ def warn_of_preset(preset: str, made_for: Mapping[str, Collection[str]], sees_im
     if seen not in made_for.get(preset, (seen,)):
         others = ", ".join(repr(name) for name, what in made_for.items() if seen in what)
         warnings.warn(
-            f"preset={preset!r} is made for {' and '.join(made_for[preset])}, and this agent sees {seen}. Made for {seen}: {others}."
+            f"preset={preset!r} is made for {' and '.join(made_for[preset])}, and this agent sees {seen}. "
+            f"Made for {seen}: {others}."
         )

@@ -119,7 +119,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
     },
 }
-#: the others serve everything. "small" was found on images, and in short runs it was not worse on vectors: docs/notes/results.md
+#: the others serve everything; "small" was found on images, and in short runs was no worse on vectors (docs/notes/results.md)
 MADE_FOR = {"small": (IMAGES, VECTORS), "vector": (VECTORS,), "state": (VECTORS,), "state-small": (VECTORS,)}
 #: what a preset proposes, and phase and intrinsic reward decide (phases.py): the argument stays None
 PROPOSED = ("ent_coef",)

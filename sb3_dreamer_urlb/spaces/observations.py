@@ -237,7 +237,8 @@ class DictObservations(Observations):
     def __init__(self, space: spaces.Space[Any], normalize_images: bool = True):
         if not isinstance(space, spaces.Dict) or len(space.spaces) == 0:
             raise UnsupportedSpaceError(
-                f'MultiInputPolicy needs a Dict of observations, got {space}. Use "CnnPolicy" for images, "MlpPolicy" for vectors.'
+                f'MultiInputPolicy needs a Dict of observations, got {space}. Use "CnnPolicy" for images, '
+                '"MlpPolicy" for vectors.'
             )
         self.parts: dict[str, Observations] = {}
         self.doubts = doubts = []

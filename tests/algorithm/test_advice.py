@@ -48,7 +48,10 @@ def seeing(space, length=None):
     [
         (IMAGE, 'Use "CnnPolicy" for images.'),
         (spaces.Box(0, 255, (1, 36, 36), np.uint8), 'Use "CnnPolicy" for images.'),
-        (spaces.Box(0, 1, (3, 16, 16), np.float32), "Use \"CnnPolicy\" and policy_kwargs={'normalize_images': False} for images."),
+        (
+            spaces.Box(0, 1, (3, 16, 16), np.float32),
+            "Use \"CnnPolicy\" and policy_kwargs={'normalize_images': False} for images.",
+        ),
         (VECTOR, None),
         (spaces.Box(0, 255, (20,), np.uint8), None),
         (spaces.Box(0, 255, (7, 7, 3), np.uint8), None),  # too small to convolve
@@ -68,9 +71,9 @@ def test_images_that_are_flattened(algorithm, space, remedy):
 
 @each
 def test_a_policy_for_other_observations_names_the_right_ones(algorithm):
-    with pytest.raises(ValueError, match='CnnPolicy needs image observations.* Use "MlpPolicy" for vectors'):
+    with pytest.raises(ValueError, match=r'CnnPolicy needs image observations.* Use "MlpPolicy" for vectors'):
         algorithm("CnnPolicy", seeing(VECTOR), preset="tiny")
-    with pytest.raises(ValueError, match='needs a Dict .* Use "CnnPolicy" for images, "MlpPolicy" for vectors|takes no Dict'):
+    with pytest.raises(ValueError, match=r'needs a Dict .* Use "CnnPolicy" for images, "MlpPolicy" for vectors|takes no Dict'):
         algorithm("MultiInputPolicy", seeing(VECTOR), preset="tiny")
 
 
@@ -87,7 +90,9 @@ def test_a_preset_for_something_else(algorithm, preset, policy, space, sees, tmp
     made_for = algorithm.presets_made_for.get(preset, (sees,))
     assert len(said) == (sees not in made_for)
     if said:
-        assert said[0].startswith(f"preset={preset!r} is made for {made_for[0]}, and this agent sees {sees}. Made for {sees}: '")
+        assert said[0].startswith(
+            f"preset={preset!r} is made for {made_for[0]}, and this agent sees {sees}. Made for {sees}: '"
+        )
         proposed = re.findall(r"'([\w-]+)'", said[0].split("Made for")[1])
         for other in proposed:
             assert told(lambda other=other: algorithm(policy, seeing(space), preset=other, **kwargs))[1] == []
