@@ -10,6 +10,7 @@ import platform
 import re
 import statistics
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -109,6 +110,17 @@ def make_model(options: argparse.Namespace, **kwargs: Any) -> DreamerV2:
     set_threads(options)
     kwargs.setdefault("compile", options.compile[0])
     return DreamerV2("CnnPolicy", NoiseImages(), preset=options.preset, device=options.device, seed=0, **kwargs)
+
+
+def fill_replay(model: Any, steps: int = 0) -> None:
+    """Episodes to draw from, and no update yet.
+
+    :param model: whose ``learning_starts`` is larger
+    :param steps: of the agent; 0 for two episodes that hold a sequence each
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"This learn\(\) will hold no update")
+        model.learn(steps or max(2 * model.batch_length, 200))
 
 
 def set_threads(options: argparse.Namespace) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from common import Floor, Product, interleaved, make_model, parser, report, tflop
+from common import Floor, Product, fill_replay, interleaved, make_model, parser, report, tflop
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.learning.learner import Learner
@@ -47,7 +47,7 @@ class Curves:
         self.precision = options.precision[0]
         self.batch = 2 if options.quick else BATCH
         self.explorer = make_model(options, precision=self.precision, intrinsic_reward="lbs")
-        self.explorer.learn(max(2 * self.explorer.batch_length, 200))  # two finished episodes; no update yet
+        fill_replay(self.explorer)
         self.planner = self._planning(options)
         # Points replace the policy's.
         self.own_planner: Any = self.planner.policy.planner

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from common import NoiseImages, interleaved, parser, report, set_threads
+from common import NoiseImages, fill_replay, interleaved, parser, report, set_threads
 
 from sb3_dreamer_urlb import DrQv2
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
@@ -32,7 +32,7 @@ def main() -> None:
                 "CnnPolicy", env, preset=options.preset, device=options.device, seed=0, buffer_size=1000, learning_starts=1000,
                 precision=precision, compile=options.compile[0], intrinsic_reward=PHASES[phase], **own,
             )  # fmt: skip
-            model.learn(300)  # three finished episodes; no update yet
+            fill_replay(model, 300)
             model.learner.set_noise(0.2)
             batch = model.replay_buffer.sample(model.batch_size)
             work[f"{phase}, {precision}"] = partial(model.learner.update, batch)

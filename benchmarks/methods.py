@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from functools import partial
 
-from common import machine, make_model, parser, seconds, write_json
+from common import fill_replay, machine, make_model, parser, seconds, write_json
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
@@ -24,7 +24,7 @@ def main() -> None:
         for name in names:
             # One model at a time: eight of paper size would not fit into every machine.
             model = make_model(options, intrinsic_reward=name)
-            model.learn(max(2 * model.batch_length, 200))
+            fill_replay(model)
             batch = model.replay_buffer.sample(model.batch_size)
             rows[name] += seconds(partial(model.learner.update, batch), 1, model.device, options.clock)
     median = {name: statistics.median(times) for name, times in rows.items()}

@@ -12,7 +12,7 @@ from itertools import product
 from typing import Any
 
 import torch as th
-from common import Floor, Product, interleaved, make_model, parser, report
+from common import Floor, Product, fill_replay, interleaved, make_model, parser, report
 
 from sb3_dreamer_urlb.learning.learner import Learner
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
@@ -50,7 +50,7 @@ def main() -> None:
     for precision, compile in product(options.precision, options.compile):
         for phase in options.phases:
             model = make_model(options, precision=precision, compile=compile, **PHASES[phase])
-            model.learn(max(2 * model.batch_length, 200))  # two finished episodes; no update yet
+            fill_replay(model)
             learner, batch = model.learner, model.replay_buffer.sample(model.batch_size)
             row = ", ".join([phase, precision, *([compile] if len(options.compile) > 1 else [])])
             work[row] = partial(learner.update, batch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -131,7 +132,9 @@ def _learn(agent: Agent, model: DreamerV2) -> None:
     # Processes share the cores, and the networks are small: more threads would wait for each other.
     th.set_num_threads(1)
     model.set_logger(configure(str(agent.folder), ["csv"]))
-    model.learn(-(-agent.frames // model.action_repeat), log_interval=1)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"This learn\(\) will hold no update")  # said before, once for both
+        model.learn(-(-agent.frames // model.action_repeat), log_interval=1)
 
 
 def _save(model: DreamerV2, path: Path) -> Path:
