@@ -105,6 +105,7 @@ setup_python() {
     now=$(fingerprint)
     if ! [[ -f $venv/.installed && $(<"$venv/.installed") == "$now" ]]; then
         install_packages
+        say "done: $venv/bin/python has all of it"
         echo "$now" >"$venv/.installed"
     fi
 }
