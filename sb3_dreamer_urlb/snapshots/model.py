@@ -70,7 +70,10 @@ def _check_readable(model: SavedAlgorithm, data: dict[str, Any], found: tensors.
         data = bounded_json.parse(bounded_json.dump(data))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            twin = blank(type(model), data, model.device, {name: own[name] for name in needed(data) if name in own}, {})
+            given = {name: own[name] for name in needed(data) if name in own}
+            # Stable-Baselines3's constructor would print the device once more.
+            quiet = {"verbose": 0} if data["arguments"].get("verbose") in (1, 2) else {}
+            twin = blank(type(model), data, model.device, {**given, **quiet}, {})
             restore_fields(twin, data)
             twin._prepare()
             described = tensors.table_without_memory(twin._new_policy, found)

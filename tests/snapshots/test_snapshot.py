@@ -224,6 +224,14 @@ def test_a_function_must_be_given_again(tiny_model, tmp_path):
     assert load(tmp_path / "m", learning_rate=0.5).lr_schedule(1) == 0.5
 
 
+def test_saving_says_nothing(tiny_model, tmp_path, capsys):
+    model = tiny_model(verbose=1)
+    capsys.readouterr()
+    model.save(tmp_path / "model")
+    assert capsys.readouterr().out == ""
+    assert DreamerV2.load(tmp_path / "model", device="cpu").verbose == 1
+
+
 def test_an_unregistered_class_must_be_given_again(tiny_model, tmp_path):
     tiny_model(intrinsic_reward=Other).save(tmp_path / "m")
     refused(tmp_path / "m.zip", r"its intrinsic_reward was test_snapshot\.Other")
