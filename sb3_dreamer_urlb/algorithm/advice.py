@@ -1,4 +1,4 @@
-"""What works, and is most likely not meant: warnings when a model is made or given an environment."""
+"""What works, and is most likely not meant: warnings when a model is made, given an environment, or fine-tuned."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS
 
 #: what presets are made for
 IMAGES, VECTORS = "images", "vectors"
+
+
+def warn_if_nothing_was_learnt(model: Any) -> None:
+    """Where a fine-tuning begins with networks that are as fresh as new ones.
+
+    :param model: that leaves its pre-training
+    """
+    if model._n_updates == 0:
+        warnings.warn(
+            f"fine_tune() keeps what a pre-training has learnt, and this one has had no update in {model.phase_frames} "
+            "frames: load a pre-trained snapshot, or learn() first."
+        )
 
 
 def warn_if_no_episode_fits(model: Any) -> None:

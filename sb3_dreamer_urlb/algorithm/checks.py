@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -55,15 +56,19 @@ def check_verbose(verbose: Any) -> None:
         raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
 
 
-def check_learn(total_timesteps: Any, log_interval: Any) -> None:
-    """What ``learn`` is told, before Stable-Baselines3 compares and divides with it.
+def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None) -> None:
+    """What ``learn`` is told, before Stable-Baselines3 compares and divides with it, and calls it.
 
     :param total_timesteps: agent steps
     :param log_interval: episodes between two log lines; None for no lines
-    :raises ValueError: for what is no such number
+    :param callback: one, several in a list, or None
+    :raises ValueError: for what is no such number or callback
     """
-    if not is_number(total_timesteps):
-        raise ValueError(f"total_timesteps must be a number of agent steps, got {total_timesteps!r}.")
+    for one in callback if isinstance(callback, list) else [callback]:
+        if not (one is None or isinstance(one, BaseCallback) or (callable(one) and not isinstance(one, type))):
+            raise ValueError(f"callback must be a callback of Stable-Baselines3, a function, or a list of them, got {one!r}.")
+    if not is_number(total_timesteps) or not total_timesteps >= 0:
+        raise ValueError(f"total_timesteps must be a number of agent steps, 0 or more, got {total_timesteps!r}.")
     if log_interval is not None:
         check_integer("log_interval", log_interval, 1)
 

@@ -175,9 +175,17 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         return wrapped
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """As ever; another environment that is assigned is set, as by :meth:`set_env`."""
+        """As ever; another environment that is assigned is set, as by :meth:`set_env`.
+
+        :raises AttributeError: for another phase, which only :meth:`fine_tune` makes
+        """
         if name == "env" and "policy" in vars(self) and not (self._sets_env or value is None or value is self.env):
             self.set_env(value)
+        elif name == "phase" and "policy" in vars(self) and value != self.phase:
+            raise AttributeError(
+                f"phase cannot be assigned, got {value!r}: the networks are those of {self.phase!r}. fine_tune() leaves the "
+                "pre-training."
+            )
         else:
             super().__setattr__(name, value)
 
@@ -251,6 +259,7 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
             env = self.prepare_fine_tuning_env(env)
         if keep_reward:
             self._check_reward_is_known(self.env if env is None else env)
+        advice.warn_if_nothing_was_learnt(self)
         if env is not None:
             before = self._vec_normalize_env
             self.set_env(env)
@@ -258,7 +267,8 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         if keep_actor is None:
             keep_actor = self.keeps_actor()
         pretrained = self.policy
-        self.phase, self.pretrained_frames = phases.FINETUNING, self.phase_frames
+        vars(self)["phase"] = phases.FINETUNING
+        self.pretrained_frames = self.phase_frames
         self.kept = {"actor": bool(keep_actor), "critic": bool(keep_critic), "reward": bool(keep_reward)}
         self.phase_timesteps, self.phase_frames, self.phase_updates = 0, 0, 0
         self.replay_buffer.close()
@@ -321,13 +331,13 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
         :param tb_log_name: name of the TensorBoard run
         :param reset_num_timesteps: restart ``num_timesteps``; the phase's own counters go on in any case
         :param progress_bar: show one
-        :raises ValueError: for what is no number of steps or episodes
+        :raises ValueError: for what is no number of steps or episodes, or no callback
         :raises MissingEnvironmentError: if the model was loaded without an environment
         :raises EnvironmentFaultError: if an environment is given up on; the last good state is saved then
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
         total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
-        checks.check_learn(total_timesteps, log_interval)
+        checks.check_learn(total_timesteps, log_interval, callback)
         needed_env(self, "learn")
         self.take_over_changes()
         with self.during_learn:

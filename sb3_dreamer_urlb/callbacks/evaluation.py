@@ -30,6 +30,7 @@ from sb3_dreamer_urlb.evaluation.episodes import (
 )
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -59,7 +60,7 @@ class EvaluationCallback(EvalCallback):
     :param seed: of the first episode
     :param kwargs: of ``EvalCallback``
     :raises ValueError: for numbers that are not positive, and, when ``learn`` begins, for an environment that the model
-        trains in, rows of a model without a seed, or ``"on"`` without a planner
+        trains in or whose spaces are not the model's, rows of a model without a seed, or ``"on"`` without a planner
     """
 
     def __init__(
@@ -110,14 +111,16 @@ class EvaluationCallback(EvalCallback):
         training = self.model.get_env()
         if training is not None and training.unwrapped is self.eval_env.unwrapped:
             raise ValueError("EvaluationCallback needs an environment of its own, it was given the one that is trained in.")
+        normalized = [unwrap_vec_normalize(env) is not None for env in (training, self.eval_env) if env is not None]
+        if len(set(normalized)) > 1:
+            raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
+        # Now, not at the first evaluation; with images as the model sees them.
+        check_same_spaces(self._dreamer._wrap_env(self.eval_env), self._dreamer)
         for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
             if folder:
                 os.makedirs(folder, exist_ok=True)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.init_callback(self.model)
-        normalized = [unwrap_vec_normalize(env) is not None for env in (training, self.eval_env) if env is not None]
-        if len(set(normalized)) > 1:
-            raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:
             raise ValueError("Rows tell runs apart by their seed: give the model one, or columns={'seed': ...}.")
         if self.planner == ON and getattr(self.model, "planner", None) is None:

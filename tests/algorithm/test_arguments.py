@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
@@ -224,7 +225,11 @@ def test_their_parts_are_named(algorithm, policy, replay, method, kwargs, messag
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        *(({"total_timesteps": value}, "total_timesteps must be a number") for value in ("5", float("nan"), None, [5], True)),
+        *(
+            ({"total_timesteps": value}, "total_timesteps must be a number")
+            for value in ("5", float("nan"), None, [5], True, -3)
+        ),
+        *(({"callback": value}, "callback must be a callback of .*, got") for value in ("eval", BaseCallback, [5])),
         *(({"log_interval": value}, "log_interval must be an integer of at least 1") for value in (0, -1, "4", 2.5)),
     ],
 )

@@ -64,6 +64,17 @@ def test_what_is_only_known_at_the_end(tiny_model):
     assert message.startswith("learn() has ended without an update") and "learning_starts=40" in message
 
 
+@pytest.mark.parametrize("steps", [0, 8, 40])
+def test_a_fine_tuning_of_fresh_networks_says_so(tiny_model, steps):
+    model = tiny_model(intrinsic_reward="lbs")
+    told(model, steps)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.fine_tune()
+    said = [str(one.message) for one in caught if "has had no update in" in str(one.message)]
+    assert len(said) == (steps < 40) and all(f"in {steps * model.action_repeat} frames" in one for one in said)
+
+
 @pytest.mark.parametrize("reason", ["no steps", "no updates wanted", "ended by a callback"])
 def test_who_wants_none_is_left_in_peace(tiny_model, reason):
     model = tiny_model(learning_starts=0, gradient_steps=0 if reason == "no updates wanted" else 1)

@@ -113,6 +113,9 @@ def test_what_cannot_work_is_said_before_learning(tiny_model: Any, tmp_path: Pat
         tiny_model(seed=None).learn(5, callback=EvaluationCallback(CounterEnv(), rows=tmp_path / "rows.csv"))
     with pytest.raises(ValueError, match="VecNormalize"):
         model.learn(5, callback=EvaluationCallback(VecNormalize(DummyVecEnv([CounterEnv]))))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.learn(5, callback=EvaluationCallback(CounterEnv(size=20), log_path=str(tmp_path / "log")))
+    assert model.num_timesteps == 0 and not (tmp_path / "log").exists()
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

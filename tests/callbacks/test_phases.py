@@ -319,6 +319,16 @@ def test_a_learn_that_ends_before_the_switch_says_so(tiny_model, frames, told):
     assert len(messages) == told and all(said in message for message in messages)
 
 
+@pytest.mark.parametrize("phase", ["finetuning", "finetune", None])
+def test_a_phase_is_not_assigned(tiny_model, tmp_path, phase):
+    model = tiny_model(vec_env(), intrinsic_reward="lbs")
+    with pytest.raises(AttributeError, match=r"phase cannot be assigned, got .*'pretraining'\. fine_tune\(\)"):
+        model.phase = phase
+    model.phase = "pretraining"  # as it is
+    model.learn(16).save(tmp_path / "model")
+    assert DreamerV2.load(tmp_path / "model").phase == "pretraining"
+
+
 def test_switch_announces_itself(tiny_model, capsys):
     tiny_model(vec_env(), intrinsic_reward="lbs").learn(16, callback=PhaseSwitchCallback(8, verbose=1))
     assert "after 8 frames" in capsys.readouterr().out
