@@ -109,7 +109,7 @@ def test_errors_are_one_line_and_status_two(fake_walker, tmp_path, capsys, argum
 
 def test_less_than_an_episode_is_enough(fake_walker, tmp_path, capsys):
     run_demo(DemoConfig(tmp_path, "walker-walk", 10, 10, episodes=1, preset="tiny"))
-    assert (tmp_path / "report.html").exists() and "mean return of 1 episodes" in capsys.readouterr().out
+    assert (tmp_path / "report.html").exists() and "mean return of 1 episode\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--finetune-frames", "-5000"]])
