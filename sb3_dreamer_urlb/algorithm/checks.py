@@ -64,9 +64,14 @@ def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None) -
     :param callback: one, several in a list, or None
     :raises ValueError: for what is no such number or callback
     """
-    for one in callback if isinstance(callback, list) else [callback]:
-        if not (one is None or isinstance(one, BaseCallback) or (callable(one) and not isinstance(one, type))):
-            raise ValueError(f"callback must be a callback of Stable-Baselines3, a function, or a list of them, got {one!r}.")
+    for one in callback if isinstance(callback, list) else []:
+        if not isinstance(one, BaseCallback):
+            raise ValueError(f"callback must be a list of callbacks of Stable-Baselines3, got one with {one!r}.")
+    known = callback is None or isinstance(callback, list | BaseCallback)
+    if not known and (isinstance(callback, type) or not callable(callback)):
+        raise ValueError(
+            f"callback must be a callback of Stable-Baselines3, a function, or a list of callbacks, got {callback!r}."
+        )
     if not is_number(total_timesteps) or not total_timesteps >= 0:
         raise ValueError(f"total_timesteps must be a number of agent steps, 0 or more, got {total_timesteps!r}.")
     if log_interval is not None:

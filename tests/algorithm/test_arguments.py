@@ -229,7 +229,7 @@ def test_their_parts_are_named(algorithm, policy, replay, method, kwargs, messag
             ({"total_timesteps": value}, "total_timesteps must be a number")
             for value in ("5", float("nan"), None, [5], True, -3)
         ),
-        *(({"callback": value}, "callback must be a callback of .*, got") for value in ("eval", BaseCallback, [5])),
+        *(({"callback": value}, "callback must be a .*, got") for value in ("eval", BaseCallback, [5], [print])),
         *(({"log_interval": value}, "log_interval must be an integer of at least 1") for value in (0, -1, "4", 2.5)),
     ],
 )
