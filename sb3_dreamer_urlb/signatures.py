@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from sb3_dreamer_urlb.unknown_names import check_keys
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 NAMELESS = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -37,6 +42,30 @@ def named_arguments(kind: type, args: Sequence[Any], kwargs: Mapping[str, Any]) 
     """
     names = [name for name, parameter in named_parameters(kind).items() if parameter.kind in POSITIONAL]
     return {**dict(zip(names, args, strict=False)), **kwargs}
+
+
+def check_keywords(kind: type, given: Iterable[str], filled_in: Iterable[str] = ()) -> None:
+    """Whether a constructor takes these keywords. One that takes any is asked itself, unless it is of this package: ours
+    hand theirs on as they are, others may take some out.
+
+    :param kind: the class
+    :param given: keywords of a call
+    :param filled_in: arguments that somebody else gives
+    :raises UnknownNameError: naming the unknown and the known ones, and which are near
+    """
+    maker = next(base for base in kind.__mro__ if "__init__" in vars(base))
+    parameters = inspect.signature(maker.__init__).parameters.values()  # type: ignore[misc]
+    takes_any = any(parameter.kind == inspect.Parameter.VAR_KEYWORD for parameter in parameters)
+    if not takes_any or maker.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        check_keys("arguments", given, named_parameters(kind).keys() - {*filled_in}, kind.__name__)
+
+
+class WithKnownKeywords:
+    """Classes whose constructor answers a keyword that there is not with those that there are."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        check_keywords(cls, kwargs)
+        return super().__new__(cls)
 
 
 def constructed(kind: Any, first: Mapping[str, Any], **others: Any) -> Any:

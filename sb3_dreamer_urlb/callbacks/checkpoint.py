@@ -13,12 +13,14 @@ from typing import Any
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.runs.resuming import ResumingCallback
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
+from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
 
-class RunCheckpointCallback(ResumingCallback):
+class RunCheckpointCallback(WithKnownKeywords, ResumingCallback):
     """Keep a run in a folder, so that it can go on after whatever killed it.
 
     With ``resume="auto"`` the same script, started again, does so: when ``learn`` begins and the folder holds a checkpoint,
@@ -50,8 +52,7 @@ class RunCheckpointCallback(ResumingCallback):
         resume: str | None = None,
     ):
         super().__init__(verbose)
-        if every_frames < 1:
-            raise ValueError(f"every_frames must be positive, got {every_frames}.")
+        check_integer("every_frames", every_frames, 1)
         if resume not in (None, "auto"):
             raise ValueError(f"resume must be 'auto' or None, got {resume!r}.")
         self.resume = resume

@@ -30,6 +30,7 @@ from sb3_dreamer_urlb.evaluation.episodes import (
 )
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.signatures import WithKnownKeywords
 from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 BOTH = "both"
 
 
-class EvaluationCallback(EvalCallback):
+class EvaluationCallback(WithKnownKeywords, EvalCallback):
     """Evaluate every so many frames of fine-tuning: SB3's ``evaluations.npz`` and rows of a CSV file.
 
     An ``EvalCallback`` of Stable-Baselines3 that counts environment frames of the phase, plays the same seeds each time,

@@ -11,9 +11,10 @@ from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.checks import check_kept
 from sb3_dreamer_urlb.number_checks import is_integer, plain
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
 
-class PhaseSwitchCallback(BaseCallback):
+class PhaseSwitchCallback(WithKnownKeywords, BaseCallback):
     """Turn a run from pre-training to fine-tuning inside one ``model.learn(...)``.
 
     The switch happens at the end of the rollout in which the phase's frames are reached, unless ``learn`` ends with it:
@@ -102,7 +103,7 @@ class PhaseSwitchCallback(BaseCallback):
             before.close()
 
 
-class FineTuneCallback(BaseCallback):
+class FineTuneCallback(WithKnownKeywords, BaseCallback):
     """Fine-tune a pre-trained snapshot from the first step of ``learn`` on: ``model.fine_tune()`` for configuration files.
 
     A model that is fine-tuning already, because its run was cut off, goes on.

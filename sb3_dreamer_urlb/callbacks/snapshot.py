@@ -11,13 +11,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.signatures import WithKnownKeywords
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, save_vec_normalize
 
 #: when the paper saves its pre-trained agents, in environment frames
 SNAPSHOT_FRAMES = (100_000, 500_000, 1_000_000, 2_000_000)
 
 
-class SnapshotCallback(BaseCallback):
+class SnapshotCallback(WithKnownKeywords, BaseCallback):
     """Save the pre-training agent whenever it has seen given numbers of frames (paper §2).
 
     Files are called ``<name_prefix>_<frames>.zip``; beside each, where the environment is a ``VecNormalize``, its statistics:

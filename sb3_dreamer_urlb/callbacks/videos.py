@@ -19,6 +19,7 @@ from sb3_dreamer_urlb.evaluation.films import labelled_agent, labelled_open_loop
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures, predict_open_loop
 from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard.writer import SummaryWriter
@@ -30,7 +31,7 @@ AGENT, OPEN_LOOP = "video/agent", "video/open_loop"
 MAX_FPS = 25
 
 
-class VideoCallback(BaseCallback):
+class VideoCallback(WithKnownKeywords, BaseCallback):
     """Films for TensorBoard's *Images* tab, every so many steps: ``video/agent`` and ``video/open_loop``.
 
     ``video/agent`` is the beginning of an episode in an environment of its own, with the planner if it is on.

@@ -6,28 +6,30 @@ import argparse
 import functools
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from unittest import mock
 
 import yaml
+from stable_baselines3.common import utils
+from stable_baselines3.common.logger import Logger
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 
 #: what Python says of arguments that a function does not have, or lacks
 SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
-#: folders of runs that this process has made
-NEW_FOLDERS: list[Path] = []
+#: folders that this process has made for a run, each with those around it that it has made, too, from within
+NEW_FOLDERS: list[list[Path]] = []
 
 
 @contextmanager
 def told_in_a_line(prog: str) -> Iterator[None]:
     """Mistakes in options, configurations and environments end the program with a line, as long as no agent has acted.
 
-    The folder that was made for a run which does not begin goes with it: ``enjoy`` would take it for the newest run.
+    The folders that were made for a run which does not begin go with it: ``enjoy`` would take one for the newest run.
     Once a run collects or a trained agent plays, whatever is raised is not about arguments, and goes on upwards.
 
     :param prog: name of the command
@@ -39,16 +41,49 @@ def told_in_a_line(prog: str) -> Iterator[None]:
         mock.patch.object(PhasedAlgorithm, name, _noted(getattr(PhasedAlgorithm, name), begun))
         for name in ("collect_rollouts", "predict")
     ]
-    with acts[0], acts[1]:
+    logs = mock.patch("stable_baselines3.common.utils.configure_logger", _noting_its_folder(utils.configure_logger))
+    with acts[0], acts[1], logs:
         try:
             yield
         except Exception as error:
             if begun or not (is_a_mistake(error) or _is_of_a_configuration(error)):
                 raise
-            for folder in NEW_FOLDERS:
-                shutil.rmtree(folder, ignore_errors=True)
+            for folder, *around in NEW_FOLDERS:
+                _take_back(folder, around)
             tell(prog, error)
             raise SystemExit(2) from error
+
+
+def missing(folder: Path) -> list[Path]:
+    """What would be made with a folder: it and those around it that are not there, from within."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def _take_back(folder: Path, around: list[Path]) -> None:
+    """
+    :param folder: goes with all that is in it
+    :param around: go where nobody else has put anything into them
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    for path in around:
+        with suppress(OSError):
+            path.rmdir()
+
+
+def _noting_its_folder(configure: Callable[..., Logger]) -> Callable[..., Logger]:
+    @functools.wraps(configure)
+    def configure_logger(verbose: int = 0, tensorboard_log: str | None = None, *args: Any, **kwargs: Any) -> Logger:
+        if tensorboard_log is None:
+            return configure(verbose, tensorboard_log, *args, **kwargs)
+        around, before = missing(Path(tensorboard_log)), set(Path(tensorboard_log).glob("*"))
+        logger = configure(verbose, tensorboard_log, *args, **kwargs)
+        folder = Path(str(logger.get_dir()))
+        # A run that goes on writes where it wrote.
+        if folder not in before:
+            NEW_FOLDERS.append([folder, *around])
+        return logger
+
+    return configure_logger
 
 
 def _noted(original: Callable[..., Any], calls: list[bool]) -> Callable[..., Any]:

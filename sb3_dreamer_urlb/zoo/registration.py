@@ -26,23 +26,12 @@ from sb3_dreamer_urlb.callbacks.phase_switch import FineTuneCallback
 from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
-from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
-from sb3_dreamer_urlb.unknown_names import did_you_mean
-from sb3_dreamer_urlb.zoo import configs, env_arguments, mistakes, pretraining, resuming, schedules
+from sb3_dreamer_urlb.zoo import configs, env_arguments, hyperparameters, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
-
-#: keys of a configuration that are rl_zoo3's or the zoo's here, no argument of the algorithm
-OWN_KEYS = (
-    *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps"),
-    *("noise_std", "noise_type", "normalize", "vec_env_wrapper", "checkpoint", "pretrain_env", "resume"),
-)
-
-#: those of them that count something
-WHOLE_NUMBERS = {"n_envs", "frame_stack"}
 
 
 def register() -> None:
@@ -101,6 +90,9 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
             configs.check(manager.config, manager.env_name.gym_id)
         hyperparams, config = original(manager)
     env_arguments.merge(manager, given, hyperparams, config)
+    hyperparameters.check(hyperparams, manager.algo, named_parameters(ALGORITHMS[manager.algo].kind))
+    if "policy" not in hyperparams:
+        raise ValueError(f"The hyperparameters of {manager.env_name.gym_id} in {manager.config} name no policy.")
     if manager.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
         raise ValueError(f"How long? Neither -n nor n_timesteps of {manager.env_name.gym_id} in {manager.config} says so.")
     hyperparams.setdefault("n_timesteps", manager.n_timesteps)  # -n is enough, rl_zoo3 wants both
@@ -124,25 +116,17 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
 
 
 def _preprocess_hyperparams(original: Callable[..., Any], manager: Any, hyperparams: dict[str, Any]) -> tuple[Any, ...]:
-    """What rl_zoo3 leaves is for the constructor: a name that it does not have is refused before a run's folder is made.
+    """What rl_zoo3 evaluates is checked before a run's folder is made; learning rates that fall are ours.
 
-    :raises ValueError: naming what may have been meant
+    :raises ValueError: for text that is no Python, and for arguments of wrappers that they do not have
     """
-    known = named_parameters(ALGORITHMS[manager.algo].kind)
-    lines = schedules.of_rates(hyperparams, known)
-    for name in WHOLE_NUMBERS & set(hyperparams):
-        check_integer(name, hyperparams[name], 1)
+    lines = schedules.of_rates(hyperparams, named_parameters(ALGORITHMS[manager.algo].kind))
     env_arguments.use_everywhere(manager, hyperparams.get("env_kwargs"))
     try:
         found: tuple[dict[str, Any], ...] = original(manager, hyperparams)
     except (NameError, SyntaxError) as error:
         raise ValueError(f"A value that is read as Python cannot be: {error}.") from error
-    if "policy" not in found[0]:
-        raise ValueError(f"The hyperparameters of {manager.env_name.gym_id} in {manager.config} name no policy.")
-    for name in found[0]:
-        if name not in known and name not in OWN_KEYS:
-            meant = did_you_mean([name], [*known, *OWN_KEYS])
-            raise ValueError(f"Unknown hyperparameter {name!r}, neither of rl_zoo3's nor of {manager.algo}'s.{meant}")
+    hyperparameters.check_evaluated(manager.normalize_kwargs, manager.monitor_kwargs)
     found[0].update(lines)
     return found
 
@@ -221,11 +205,12 @@ def _maybe_normalize(original: Callable[..., Any], manager: Any, env: VecEnv, ev
 
 
 def _create_log_folder(original: Callable[..., Any], manager: Any) -> None:
-    """Note which folder is new, for the case that the start is refused."""
-    is_new = not Path(manager.save_path).exists()
+    """Note which folders are new, for the case that the start is refused."""
+    run = Path(manager.save_path)
+    new = mistakes.missing(run)
     original(manager)
-    if is_new:
-        mistakes.NEW_FOLDERS.append(Path(manager.save_path))
+    if run in new:
+        mistakes.NEW_FOLDERS.append(new)
 
 
 def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:

@@ -218,7 +218,7 @@ def test_a_damaged_folder_is_refused(tiny_model, tmp_path, damage):
 
 @pytest.mark.parametrize("frames", [0, -1])
 def test_frames_must_be_positive(tmp_path, frames):
-    with pytest.raises(ValueError, match=f"every_frames must be positive, got {frames}"):
+    with pytest.raises(ValueError, match=f"every_frames must be an integer of at least 1, got {frames}"):
         RunCheckpointCallback(tmp_path, frames)
 
 

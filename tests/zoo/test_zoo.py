@@ -24,6 +24,7 @@ from gymnasium.envs.registration import EnvSpec
 from places import PYTHONPATH, ROOT
 from rl_zoo3.exp_manager import ExperimentManager
 from snapshot_files import code_events
+from stable_baselines3.common import utils
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
@@ -33,7 +34,7 @@ from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback
 from sb3_dreamer_urlb.dreamer_v2.presets import PRESETS
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, env_id
 from sb3_dreamer_urlb.hub.privacy import without_private_paths
-from sb3_dreamer_urlb.zoo import configs, pretraining, registration
+from sb3_dreamer_urlb.zoo import configs, mistakes, pretraining, registration
 from sb3_dreamer_urlb.zoo import hub as zoo_hub
 from sb3_dreamer_urlb.zoo.__main__ import COMMANDS, main
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
@@ -299,16 +300,44 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("frame_stack:0", "frame_stack must be an integer of at least 1, got 0"),
         ("normalize:'yes please'", "A value that is read as Python cannot be"),
         ("policy:'CnnPolcy'", "Unknown policy 'CnnPolcy'"),
-        (f"callback:'{SWITCH}s'", "has no attribute 'PhaseSwitchCallbacks'"),
-        ("callback:'nowhere.Callback'", "No module named 'nowhere'"),
-        (f"callback:[{{'{SWITCH}': dict(frames=80)}}]", "got an unexpected keyword argument 'frames'"),
-        ("monitor_kwargs:dict(overide=True)", "got an unexpected keyword argument 'overide'"),
+        (
+            "polcy:'MlpPolicy'",
+            "Unknown hyperparameter 'polcy', neither of rl_zoo3's nor of dreamerv2's. Did you mean 'policy'",
+        ),
+        ("policy:3", "policy must be the name of one, as CnnPolicy, got 3"),
+        ("n_timesteps:'long'", "n_timesteps must be a positive number of agent steps, got 'long'"),
+        ("n_timesteps:'1e6'", "n_timesteps: YAML reads 1e6 as text, not as a number: write 1000000."),
+        ("learning_rate:'1e-4'", "learning_rate: YAML reads 1e-4 as text, not as a number: write 1.0e-4."),
+        ("policy_kwargs:dict(gamma='9.9E-1')", "policy_kwargs: gamma: YAML reads 9.9E-1 as text"),
+        (f"callback:[{{'{SWITCH}': dict(pretrain_frames='2e2')}}]", f"callback: {SWITCH}: pretrain_frames: YAML reads 2e2 as"),
+        (
+            f"callback:'{SWITCH[:-2]}'",
+            "callback: sb3_dreamer_urlb has no 'PhaseSwitchCallba'. Did you mean 'PhaseSwitchCallback'",
+        ),
+        ("callback:'PhaseSwitchCallback'", f"expected module.Class, got 'PhaseSwitchCallback'. Did you mean '{SWITCH}'"),
+        ("callback:'sb3_dreamer.PhaseSwitchCallback'", f"No module named 'sb3_dreamer'. Did you mean '{SWITCH}'"),
+        ("callback:'nowhere.Callback'", "callback: nowhere.Callback cannot be imported: No module named 'nowhere'"),
+        (
+            "env_wrapper:'gymnasium.wrappers.TimeLimt'",
+            "env_wrapper: gymnasium.wrappers has no 'TimeLimt'. Did you mean 'TimeLi",
+        ),
+        ("env_wrapper:{'gymnasium.wrappers.TimeLimit': dict(max_steps=3)}", "TimeLimit; known are ['max_episode_steps']"),
+        (f"callback:[{{'{SWITCH}': dict(frames=80)}}]", "Unknown arguments ['frames'] for PhaseSwitchCallback; known are ["),
+        (f"callback:[{{'{SWITCH}': dict(frames=80)}}]", "Did you mean 'pretrain_frames'?"),
+        (f"callback:[{{'{SWITCH}': None}}]", "callback: expected arguments of PhaseSwitchCallback by name, got None"),
+        (f"callback:[{{'{SWITCH}': {{}}, 'frames': 3}}]", f"got 2 side by side: {SWITCH}, frames"),
+        ("checkpoint:dict(every_frame=10)", "Unknown checkpoint ['every_frame']; known are ['every_frames', "),
+        ("checkpoint:dict(every_frames='x')", "every_frames must be an integer of at least 1, got 'x'"),
+        ("normalize:dict(norm_rewards=False)", "Unknown normalize ['norm_rewards']; known are ["),
+        ("normalize:'dict(norm_rewards=False)'", "Did you mean 'norm_reward'"),
+        ("monitor_kwargs:dict(overide=True)", "Unknown monitor_kwargs ['overide']; known are ["),
         ("replay_buffer_kwargs:dict(stor='x')", "Unknown replay_buffer_kwargs ['stor']; known are"),
     ],
 )
 def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
     line = refused(capsys, train, zoo, STAND, 8, "lbs", params=[*TINY, param])
     assert message in line
+    assert not Path("logs").exists()
 
 
 @pytest.mark.parametrize(
@@ -316,6 +345,11 @@ def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
     [
         (f"{STAND}:\n  policy: CnnPolicy\n", f"Neither -n nor n_timesteps of {STAND} in own.yml"),
         (f"{STAND}:\n  n_timesteps: 8\n  preset: tiny\n", f"hyperparameters of {STAND} in own.yml name no policy"),
+        (
+            f"{STAND}:\n  policy: CnnPolicy\n  n_timestep: 8\n",
+            "'n_timestep', neither of rl_zoo3's nor of dreamerv2's. Did you mean 'n_t",
+        ),
+        (f"{STAND}:\n  n_timesteps: 8\n  polcy: CnnPolicy\n", "Did you mean 'policy'"),
         (f"{FLIP}:\n  policy: CnnPolicy\n", f"Hyperparameters not found for dreamerv2-{STAND} in own.yml"),
         (f"{STAND}: 3\n", f"own.yml: expected hyperparameters by environment, got 3 for {STAND}"),
         ("- a\n", "own.yml: expected hyperparameters by environment, got ['a']"),
@@ -326,7 +360,32 @@ def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
 def test_a_wrong_configuration_costs_a_line(zoo, capsys, text, message):
     Path("own.yml").write_text(text)
     assert message in refused(capsys, zoo, *TRAIN, "--env", STAND, "-conf", "own.yml", "--eval-freq", "-1")
-    assert not Path("logs/dreamerv2").exists()
+    assert not Path("logs").exists()
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_start_that_is_refused_leaves_no_folder(zoo, capsys, there):
+    """As the fine-tuning does that is given no snapshot, when learn() begins; what was there before stays."""
+    folders = [Path("logs/dreamerv2"), Path("tb/urlb-walker-stand-v0")] if there else []
+    for folder in folders:
+        folder.mkdir(parents=True)
+    line = refused(capsys, train, zoo, STAND, 8, "finetune", "-tb", "tb", params=TINY[:1])
+    assert "FineTuneCallback needs a pre-trained model" in line
+    left = {path for folder in folders for path in (folder, folder.parent)}
+    assert set(Path().rglob("*")) == left
+
+
+def test_a_log_that_goes_on_is_not_taken_back(tmp_path):
+    """TensorBoard's of a run that was there before."""
+    with pytest.raises(SystemExit), mistakes.told_in_a_line("zoo"):
+        utils.configure_logger(0, str(tmp_path / "tb"), "run", True)
+        raise ValueError
+    assert not (tmp_path / "tb").exists()
+    utils.configure_logger(0, str(tmp_path / "tb"), "run", True).close()
+    with pytest.raises(SystemExit), mistakes.told_in_a_line("zoo"):
+        utils.configure_logger(0, str(tmp_path / "tb"), "run", False)
+        raise ValueError
+    assert [path.name for path in (tmp_path / "tb").iterdir()] == ["run_1"]
 
 
 def test_an_environment_that_is_not_there_costs_a_line(zoo, capsys):
