@@ -25,7 +25,7 @@ from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.facts import facts_about
-from sb3_dreamer_urlb.hub.repositories import MISSING_HUB, RepoId, check_filename, open_repository
+from sb3_dreamer_urlb.hub.repositories import CONFIG, MISSING_HUB, RepoId, check_filename, open_repository
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.snapshots import bounded_json
 from sb3_dreamer_urlb.snapshots.vec_normalize import save_vec_normalize
@@ -33,7 +33,7 @@ from sb3_dreamer_urlb.snapshots.vec_normalize import save_vec_normalize
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 
-CARD, CONFIG, RESULTS, FILM, STATISTICS = "README.md", "config.json", "results.json", "replay.mp4", "vec_normalize.json"
+CARD, RESULTS, FILM, STATISTICS = "README.md", "results.json", "replay.mp4", "vec_normalize.json"
 MAX_CONFIG = 1 << 20
 
 
@@ -146,7 +146,7 @@ def load_from_hub(repo_id: RepoId, filename: str | None = None, revision: str | 
     :param revision: branch, tag or commit on the Hub
     :param token: of the Hub, for private repositories
     :return: where the file is on this machine
-    :raises FileNotFoundError: if the repository has no such file
+    :raises FileNotFoundError: if there is no such folder, or no such file in the repository
     :raises ValueError: if the repository does not say which file is the model
     """
     repository = open_repository(repo_id, token, revision)

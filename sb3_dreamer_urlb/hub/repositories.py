@@ -15,6 +15,8 @@ RepoId = str | os.PathLike[str]
 
 MISSING_HUB = f"Sharing models needs huggingface_hub and imageio-ffmpeg; {how_to_install('hub')}."
 LIBRARY = "sb3_dreamer_urlb"
+#: what says which file is the model; everything that `package_to_hub` makes has one
+CONFIG = "config.json"
 #: what the Hub allows, roughly; it says itself what exactly is wrong with a name
 HUB_ID = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
 
@@ -71,8 +73,20 @@ class FolderRepository(Repository):
     def download(self, filename: str) -> Path:
         path = self.folder / filename
         if not path.is_file():
-            raise FileNotFoundError(2, f"No such file in the repository {self.name}", filename)
+            raise self._missing(filename)
         return path
+
+    def _missing(self, filename: str) -> FileNotFoundError:
+        if not self.folder.is_dir():
+            return FileNotFoundError(2, "There is no such folder", self.name)
+        if (self.folder / CONFIG).is_file():
+            return FileNotFoundError(2, f"No such file in the repository {self.name}", filename)
+        return FileNotFoundError(
+            2,
+            f"No such file in {self.name}, which holds no model that package_to_hub put there: it has no {CONFIG}. A model "
+            "card's code, which says './', is run in the card's own folder",
+            filename,
+        )
 
 
 class HubRepository(Repository):

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from unittest import mock
 
+from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import how_to_install
 
@@ -85,8 +86,10 @@ def _share(command: str, rest: list[str], prog: str) -> int:
 
     try:
         print({"push_to_hub": hub.push, "load_from_hub": hub.load}[command](rest, prog))
-    except (ValueError, ImportError, FileNotFoundError, AssertionError) as error:
-        print(f"{prog}: {error}", file=sys.stderr)
+    except Exception as error:
+        if not (is_a_mistake(error) or isinstance(error, AssertionError)):
+            raise
+        tell(prog, error)
         return 2
     return 0
 

@@ -36,11 +36,11 @@ def check_there_are_runs(envs: list[str], folder: str, algo: str, prog: str) -> 
         raise SystemExit(2)
 
 
-def that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callable[..., Any]:
-    """rl_zoo3's look for a trained model; one that is not there costs a line, with those that are, in place of a traceback.
+def finding(original: Callable[..., Any]) -> Callable[..., Any]:
+    """rl_zoo3's look for a trained model, whose error also says which runs there are.
 
     :param original: ``rl_zoo3.utils.get_model_path``
-    :param prog: who says it
+    :return: the same; it raises ValueError for a model that is not there
     """
 
     @functools.wraps(original)
@@ -48,7 +48,26 @@ def that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callable
         try:
             return original(exp_id, folder, algo, *args, **kwargs)
         except (AssertionError, ValueError) as error:
-            print(f"{prog}: {str(error).rstrip('.')}; {what_there_is(folder, algo)}", file=sys.stderr)
+            raise ValueError(f"{str(error).rstrip('.')}; {what_there_is(folder, algo)}") from error
+
+    return get_model_path
+
+
+def that_says_what_there_is(original: Callable[..., Any], prog: str) -> Callable[..., Any]:
+    """rl_zoo3's look for a trained model; one that is not there costs a line, with those that are, in place of a traceback.
+
+    :param original: ``rl_zoo3.utils.get_model_path``
+    :param prog: who says it
+    """
+
+    found = finding(original)
+
+    @functools.wraps(original)
+    def get_model_path(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return found(*args, **kwargs)
+        except ValueError as error:
+            print(f"{prog}: {error}", file=sys.stderr)
             raise SystemExit(2) from error
 
     return get_model_path

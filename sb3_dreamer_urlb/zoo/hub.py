@@ -22,6 +22,7 @@ from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_mode
 from sb3_dreamer_urlb.hub.privacy import as_plain, plain_for_everybody
 from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
+from sb3_dreamer_urlb.zoo.found_runs import finding
 
 CONFIG, ARGUMENTS, ENV_KWARGS, METRICS = "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip"
 #: of the command line that trained; the rest names things of that machine
@@ -56,7 +57,7 @@ def push(argv: Sequence[str], prog: str) -> str:
     options = parser.parse_args(argv)
 
     env_name = options.env.replace("/", "-")
-    _, model_path, log_path = get_model_path(
+    _, model_path, log_path = finding(get_model_path)(
         options.exp_id, options.folder, options.algo, _zoo_name(options.env),
         options.load_best, options.load_checkpoint, options.load_last_checkpoint,
     )  # fmt: skip

@@ -239,6 +239,22 @@ def test_one_file(model, tmp_path):
         push_to_hub(tmp_path / "shared", tmp_path / "nothing.zip")
 
 
+def test_a_folder_that_is_not_there_and_one_without_a_model(tmp_path, monkeypatch):
+    """What the code of a card meets in another folder than the card's."""
+    for filename in (None, "vec_normalize.json"):
+        with pytest.raises(FileNotFoundError, match=f"There is no such folder: '{tmp_path}/nohub'"):
+            load_from_hub(tmp_path / "nohub", filename)
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(
+            FileNotFoundError, match=rf"file in {tmp_path}, which holds no model .*no config\.json\. .*own folder"
+        ):
+            load_from_hub("./", filename)
+    (tmp_path / "config.json").write_text('{"model": "model.zip"}')
+    for filename in (None, "model.zip"):
+        with pytest.raises(FileNotFoundError, match=f"No such file in the repository {tmp_path}: 'model.zip'"):
+            load_from_hub("./", filename)
+
+
 # -- strangers -------------------------------------------------------------------------------------------------------------
 
 

@@ -624,8 +624,8 @@ def test_a_normalised_run_is_shared_without_pickles(zoo, monkeypatch, capsys):
 
 def test_mistakes_in_sharing_are_named(zoo, capsys):
     for arguments, message in (
-        (["push_to_hub", *SHARE, "-f", "logs"], "folder was not found"),
-        (["load_from_hub", *SHARE, "-f", "logs"], "No such file"),
+        (["push_to_hub", *SHARE, "-f", "logs"], "folder was not found; no run in logs/dreamerv2 (-f names it)"),
+        (["load_from_hub", *SHARE, "-f", "logs"], "There is no such folder: '/"),
         (["load_from_hub", *SHARE[:-1], "a/b", "-f", "logs"], "repo_id must be 'user/name'"),
     ):
         assert main(arguments) == 2
