@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.normalized import hides_originals
+from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
 from sb3_dreamer_urlb.number_checks import (
@@ -133,6 +134,8 @@ def check_settings(model: SavedAlgorithm) -> None:
         raise ValueError(f"seed must be an integer in [0, 2**32), or None, got {model.seed!r}.")
     if model.tensorboard_log is not None and not isinstance(model.tensorboard_log, str | os.PathLike):
         raise ValueError(f"tensorboard_log must be the path of a folder or None, got {model.tensorboard_log!r}.")
+    if model.tensorboard_log is not None:
+        check_folder("tensorboard_log", model.tensorboard_log)
     for name in ("policy_kwargs", "replay_buffer_kwargs"):
         check_dict(name, getattr(model, name))
 
@@ -145,7 +148,9 @@ def check_schedule_of_updates(model: SavedAlgorithm) -> None:
     """
     frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
     if not is_integer(frequency) or frequency < 1:
-        raise ValueError(f"train_freq must be a positive integer, or such a one with its unit, got {model.train_freq!r}.")
+        raise ValueError(
+            f'train_freq must be a positive integer, or one with its unit, as (1, "episode"), got {model.train_freq!r}.'
+        )
     if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
         raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
 

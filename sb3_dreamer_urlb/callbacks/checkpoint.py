@@ -13,6 +13,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.runs.resuming import ResumingCallback
@@ -56,6 +57,7 @@ class RunCheckpointCallback(WithKnownKeywords, ResumingCallback):
         if resume not in (None, "auto"):
             raise ValueError(f"resume must be 'auto' or None, got {resume!r}.")
         self.resume = resume
+        check_folder("folder", folder)
         self.folder = Path(folder)
         self.every_frames = every_frames
         self.evaluation = evaluation

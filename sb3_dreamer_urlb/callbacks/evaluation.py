@@ -28,6 +28,7 @@ from sb3_dreamer_urlb.evaluation.episodes import (
     run_evaluation,
     without_planner,
 )
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
@@ -117,9 +118,9 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
             raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
         # Now, not at the first evaluation; with images as the model sees them.
         check_same_spaces(self._dreamer._wrap_env(self.eval_env), self._dreamer)
-        for folder in (self.best_model_save_path, self.log_path and os.path.dirname(self.log_path)):
+        for name, folder in (("best_model_save_path", self.best_model_save_path), ("log_path", self.log_path)):
             if folder:
-                os.makedirs(folder, exist_ok=True)
+                made_folder(name, folder if name != "log_path" else os.path.dirname(folder))
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.init_callback(self.model)
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:

@@ -9,6 +9,7 @@ from pathlib import Path
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.folders import check_folder, made_folder
 from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
@@ -29,6 +30,7 @@ class SnapshotCallback(WithKnownKeywords, BaseCallback):
     :param name_prefix: of the files
     :param verbose: 1 prints each path
     :raises ValueError: for numbers of frames that are not positive
+    :raises NotADirectoryError: if ``save_path`` is a file
     """
 
     def __init__(
@@ -41,13 +43,14 @@ class SnapshotCallback(WithKnownKeywords, BaseCallback):
         super().__init__(verbose)
         if not isinstance(frames, Sequence) or any(not is_integer(frame) or frame < 1 for frame in frames):
             raise ValueError(f"frames must be a sequence of positive integers, got {frames!r}.")
+        check_folder("save_path", save_path)
         self.save_path = os.fspath(save_path)
         self.frames = sorted(frames)
         self.name_prefix = name_prefix
         self.pending: list[int] = []
 
     def _init_callback(self) -> None:
-        os.makedirs(self.save_path, exist_ok=True)
+        made_folder("save_path", self.save_path)
         model: PhasedAlgorithm = self.model  # type: ignore[assignment]
         self.pending = [frame for frame in self.frames if frame > model.phase_frames]
 

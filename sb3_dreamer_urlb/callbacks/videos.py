@@ -18,6 +18,7 @@ from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.evaluation.films import labelled_agent, labelled_open_loop
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures, predict_open_loop
+from sb3_dreamer_urlb.folders import check_folder, made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
@@ -78,6 +79,8 @@ class VideoCallback(WithKnownKeywords, BaseCallback):
         self.horizon = horizon
         self.open_loop_start = open_loop_start
         self.deterministic = deterministic
+        if folder is not None:
+            check_folder("folder", folder)
         self.folder = None if folder is None else Path(folder)
         for name in ("video_freq", "video_length", "context", "horizon"):
             check_integer(name, getattr(self, name), 1)
@@ -155,8 +158,7 @@ class VideoCallback(WithKnownKeywords, BaseCallback):
         for writer in self._writers():
             add_gif(writer, tag, film, frames[0].shape, self.num_timesteps)
         if self.folder is not None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            path = self.folder / f"{tag.split('/')[1]}_{self.num_timesteps}.gif"
+            path = made_folder("folder", self.folder) / f"{tag.split('/')[1]}_{self.num_timesteps}.gif"
             path.write_bytes(film)
             if self.verbose >= 1:
                 print(f"Filmed {path}")

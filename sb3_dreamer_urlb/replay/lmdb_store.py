@@ -21,6 +21,7 @@ from typing import IO, Any
 import lmdb
 import numpy as np
 
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.replay.rows import NamedRows
 
 #: rows that are read and written together
@@ -79,7 +80,7 @@ class LmdbStore:
         self.row_bytes = {name: dtype.itemsize * int(np.prod(shape)) for name, (dtype, shape) in layout.items()}
         columns = {name: [str(dtype), list(shape)] for name, (dtype, shape) in layout.items()}
         self._identity = {"version": VERSION, "chunk": CHUNK, "columns": columns, **identity}
-        self.path.mkdir(parents=True, exist_ok=True)
+        made_folder("replay_buffer_kwargs: path", self.path)
         self._lock = self._take_lock()
         try:
             self.env = lmdb.open(str(path), map_size=map_size - self.reserve, readahead=False, meminit=False, max_dbs=0)

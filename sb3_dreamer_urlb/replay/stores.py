@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch as th
 
+from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.version import how_to_install
 
 AUTO, MEMORY, DEVICE, LMDB = STORES = ("auto", "memory", "device", "lmdb")
@@ -31,6 +32,8 @@ def check_store(store: str, path: str | os.PathLike[str] | None, map_size: int |
         raise ValueError(f"store must be one of {list(STORES)}, got {store!r}.")
     if (store == LMDB) != (path is not None):
         raise ValueError(f"store={store!r} and path={path!r}: a path is for store='lmdb', which needs one.")
+    if path is not None:
+        check_folder("replay_buffer_kwargs: path", path)
     if map_size is not None and (store != LMDB or map_size < 1 << 20):
         raise ValueError(f"map_size must be at least {1 << 20} bytes, and is for store='lmdb' only, got {map_size!r}.")
     if store == LMDB:

@@ -21,6 +21,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
@@ -132,7 +133,7 @@ class RunFolder:
 
         :raises RuntimeError: if another process, or another run of this one, is in the folder
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        made_folder("folder", self.path)
         with open(self.path / LOCK, "a+") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

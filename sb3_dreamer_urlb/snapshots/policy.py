@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -72,10 +73,14 @@ def load(
                     f"give it again: load(..., custom_objects={{{name!r}: ...}})"
                 )
         found = tensors.read_table(archive, TENSORS)
+        try:
+            _compare(kind, parameters, found)
+        except ValueError as error:
+            its = next((other for other in others if _fits(other, parameters, found)), None)
+            if its is None:
+                raise
+            raise ValueError(f"it is no {kind.__module__}.{kind.__qualname__}: it is one of {_reader(its)}") from error
         constructor: Any = kind
-        tensors.compare(
-            found, tensors.table_without_memory(lambda: constructor(lr_schedule=_no_schedule, **parameters), found)
-        )
         policy: Policy = constructor(lr_schedule=_no_schedule, **parameters)
         policy.load_state_dict(tensors.unpack(archive, TENSORS))
         return policy.to(device)
@@ -92,15 +97,38 @@ def _check_kind(kind: type[Any], parameters: dict[str, Any], others: Iterable[ty
     if not unknown:
         return
     its = [other for other in others if set(parameters) <= set(named_parameters(other)) and _takes(other, parameters)]
-    hint = f": it is one of {its[0].__module__}.{its[0].__qualname__}" if its else ""
+    hint = f": it is one of {_reader(its[0])}" if its else ""
     raise ValueError(f"its policy has an argument {unknown[0]!r}, which {kind.__module__}.{kind.__qualname__} has not{hint}")
 
 
-def _takes(kind: Any, parameters: dict[str, Any]) -> bool:
-    try:
-        kind.check_spaces(*(parameters[name] for name in ("observation_space", "action_space", "normalize_images")))
-    except (ValueError, LookupError):
+def _reader(kind: type[Any]) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}, whose load() reads it"
+
+
+def _compare(kind: Any, parameters: dict[str, Any], found: Any) -> None:
+    """:raises ValueError: if the policy cannot be made of these parameters, or has other weights"""
+    tensors.compare(found, tensors.table_without_memory(lambda: kind(lr_schedule=_no_schedule, **parameters), found))
+
+
+def _fits(kind: type[Any], parameters: dict[str, Any], found: Any) -> bool:
+    if not set(parameters) <= set(named_parameters(kind)):
         return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            _compare(kind, parameters, found)
+        except (ValueError, TypeError):
+            return False
+    return True
+
+
+def _takes(kind: Any, parameters: dict[str, Any]) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            kind.check_spaces(*(parameters[name] for name in ("observation_space", "action_space", "normalize_images")))
+        except (ValueError, LookupError):
+            return False
     return True
 
 

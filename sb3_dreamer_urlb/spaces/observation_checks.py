@@ -9,6 +9,8 @@ import torch as th
 from gymnasium import spaces
 
 Observation = np.ndarray | dict[str, np.ndarray]
+#: characters of what was given, in messages
+SHOWN = 80
 
 
 def checked_observation(observation: Any, space: spaces.Space[Any]) -> Observation:
@@ -48,7 +50,7 @@ def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
             f"{name} must have the shape {shape}, its channels first or last, or with a leading n: got {array.shape}."
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite, got {str(array.tolist())[:80]}.")
+        raise ValueError(f"{name} must be finite, got {_numbers(array)}.")
     _check_classes(name, array, space)
     # Views with negative strides (a mirrored image) are arrays that torch does not take.
     return np.ascontiguousarray(array).reshape(array.shape)
@@ -61,8 +63,20 @@ def _check_classes(name: str, array: np.ndarray, space: spaces.Space[Any]) -> No
     least, count = (space.start, space.n) if isinstance(space, spaces.Discrete) else (space.start, space.nvec)
     wrong_shape = array.ndim < len(space.shape or ()) or (space.shape and array.shape[-len(space.shape) :] != space.shape)
     if not wrong_shape and not ((array >= least) & (array < least + count)).all():
-        raise ValueError(f"{name} must be in {space}, got {str(array.tolist())[:80]}.")
+        raise ValueError(f"{name} must be in {space}, got {_numbers(array)}.")
+
+
+def _numbers(array: np.ndarray) -> str:
+    """The whole array where it is short; of a long one the first and last numbers, and how many are not finite."""
+    whole = str(array.tolist()) if array.size <= SHOWN else ""
+    if 0 < len(whole) <= SHOWN:
+        return whole
+    ends = [f"{number:g}" for number in array.reshape(-1)[[0, 1, -2, -1]].tolist()]
+    wrong = np.count_nonzero(~np.isfinite(array))
+    how_many = f", {wrong} of {array.size} not finite" if wrong else ""
+    return f"[{', '.join([*ends[:2], '...', *ends[2:]])}] of the shape {array.shape}{how_many}"
 
 
 def _shown(value: Any) -> str:
-    return f"{type(value).__name__} {str(value)[:80]!r}"
+    text = str(value)
+    return f"{type(value).__name__} {text if len(text) <= SHOWN else text[: SHOWN - 3] + '...'!r}"

@@ -22,6 +22,7 @@ from sb3_dreamer_urlb.drq_v2.policies import DrQPolicy
 from sb3_dreamer_urlb.intrinsic import TransitionReward
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
+from sb3_dreamer_urlb.spaces.observation_checks import checked_observation
 
 #: algorithm, its policies, its replay, a way to explore
 KINDS = [
@@ -323,6 +324,25 @@ def test_observations_that_are_not_finite_are_refused(algorithm, policy, replay,
     model = algorithm("MlpPolicy", CounterEnv(observation_space=space), preset="tiny", device="cpu")
     with pytest.raises(ValueError, match=r"must be finite, got \[0.0, .*\]"):
         model.predict(np.array([0, value, 0], np.float32))
+
+
+@pytest.mark.parametrize("shape", [(24,), (2, 30)])
+def test_long_observations_are_shown_by_their_ends(shape):
+    space = spaces.Box(-1, 1, shape[-1:], np.float32)
+    observation = np.zeros(shape, np.float32)
+    observation[..., -1] = np.nan
+    with pytest.raises(ValueError) as told:
+        checked_observation(observation, space)
+    count = observation.size // shape[-1]
+    assert str(told.value) == (
+        f"The observation must be finite, got [0, 0, ..., 0, nan] of the shape {shape}, "
+        f"{count} of {observation.size} not finite."
+    )
+    classes = spaces.MultiDiscrete([3] * 60)
+    with pytest.raises(ValueError, match=r"got \[9, 9, \.\.\., 9, 9\] of the shape \(60,\)\.$"):
+        checked_observation(np.full(60, 9), classes)
+    with pytest.raises(ValueError, match=r"got str 'o{77}\.\.\.'"):
+        checked_observation("o" * 100, space)
 
 
 @pytest.mark.parametrize(("name", "value"), [("tau", 0), ("gamma", "x"), ("noise_std", -1), ("learning_rate", None)])
