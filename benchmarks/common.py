@@ -26,6 +26,7 @@ from stable_baselines3.common.utils import get_device
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2, native
+from sb3_dreamer_urlb.algorithm.updates_due import NoUpdateWarning
 from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 
 
@@ -119,7 +120,7 @@ def fill_replay(model: Any, steps: int = 0) -> None:
     :param steps: of the agent; 0 for two episodes that hold a sequence each
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"This learn\(\) will hold no update")
+        warnings.simplefilter("ignore", NoUpdateWarning)
         model.learn(steps or max(2 * model.batch_length, 200))
 
 

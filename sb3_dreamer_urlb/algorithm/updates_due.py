@@ -10,6 +10,10 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 
 
+class NoUpdateWarning(UserWarning):
+    """A ``learn`` that begins will teach nothing: who means it so can filter this."""
+
+
 class UpdatesDue:
     """Watches one ``learn``, and warns at once if it will end within the warm-up of its phase.
 
@@ -28,7 +32,9 @@ class UpdatesDue:
         rollout = frequency * model.n_envs
         end = model.phase_timesteps + math.ceil(self.steps / rollout) * rollout
         if end <= model.learning_starts:
-            self._warn(f"This learn() will hold no update: it ends after {end} agent steps of {model.phase}, {self._warm_up}")
+            self.told = True
+            warning = f"This learn() will hold no update: it ends after {end} agent steps of {model.phase}, {self._warm_up}"
+            warnings.warn(warning, NoUpdateWarning)
 
     def ended(self) -> None:
         """Warn if there was none, unless a callback ended it early."""
@@ -38,12 +44,10 @@ class UpdatesDue:
         why = self._warm_up
         if model.phase_timesteps > model.learning_starts:
             why = f"and the replay still waits for {model.replay_buffer.waits_for}."
-        self._warn(f"learn() has ended without an update, after {model.phase_timesteps} agent steps of {model.phase}, {why}")
+        warnings.warn(
+            f"learn() has ended without an update, after {model.phase_timesteps} agent steps of {model.phase}, {why}"
+        )
 
     @property
     def _warm_up(self) -> str:
         return f"and updates begin after learning_starts={self.model.learning_starts}: more steps, or fewer of those?"
-
-    def _warn(self, message: str) -> None:
-        self.told = True
-        warnings.warn(message)

@@ -118,9 +118,10 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
             raise ValueError("Either both the training and the evaluation environment are in a VecNormalize, or neither is.")
         # Now, not at the first evaluation; with images as the model sees them.
         check_same_spaces(self._dreamer._wrap_env(self.eval_env), self._dreamer)
-        for name, folder in (("best_model_save_path", self.best_model_save_path), ("log_path", self.log_path)):
+        logs = self.log_path and os.path.dirname(self.log_path)
+        for name, folder in (("best_model_save_path", self.best_model_save_path), ("log_path", logs)):
             if folder:
-                made_folder(name, folder if name != "log_path" else os.path.dirname(folder))
+                made_folder(name, folder)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.init_callback(self.model)
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:

@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
+from sb3_dreamer_urlb.algorithm.updates_due import NoUpdateWarning
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs import RenderingBackendError
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
@@ -133,7 +134,7 @@ def _learn(agent: Agent, model: DreamerV2) -> None:
     th.set_num_threads(1)
     model.set_logger(configure(str(agent.folder), ["csv"]))
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"This learn\(\) will hold no update")  # said before, once for both
+        warnings.simplefilter("ignore", NoUpdateWarning)  # said before, once for both
         model.learn(-(-agent.frames // model.action_repeat), log_interval=1)
 
 

@@ -11,11 +11,11 @@ from gymnasium.envs.registration import EnvSpec
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.privacy import plain_for_everybody, without_private_paths
-from sb3_dreamer_urlb.intrinsic import ExplorationMethod, registered_intrinsic_rewards
 from sb3_dreamer_urlb.phases import PRETRAINING
-from sb3_dreamer_urlb.planning import planner_name, registered_planners
+from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.model_data import describe, needed
+from sb3_dreamer_urlb.snapshots.registered import registered_name, registries
 
 FROM_SCRATCH = "none, learnt from scratch"
 
@@ -120,15 +120,9 @@ def own_parts(model: AgentAlgorithm) -> dict[str, OwnPart]:
     stored = {"policy": data["policy"], **data["arguments"]}
     customs = {name: values.contains_custom(values.decode(stored[name])) for name in needed(data) if name in stored}
     found = {name: OwnPart(custom.description, None) for name, custom in customs.items() if custom is not None}
-    kinds: dict[str, dict[str, tuple[type, ...]]] = {
-        "planner": {**registered_planners()},
-        "intrinsic_reward": {name: (kind,) for name, kind in registered_intrinsic_rewards(ExplorationMethod).items()},
-    }
-    for name, registered in kinds.items():
-        given = getattr(model, name, None)
-        kind = given if isinstance(given, type) else type(given)
-        known_as = given if isinstance(given, str) else next((n for n, classes in registered.items() if kind in classes), None)
-        for one in registered.get(known_as or "", ())[:1] if name not in found else ():
-            if not one.__module__.startswith("sb3_dreamer_urlb."):
-                found[name] = OwnPart(f"{one.__module__}.{one.__qualname__}", known_as)
+    for argument, registry in registries().items():
+        name = registered_name(stored.get(argument))
+        kind = None if name is None else registry.kinds.get(name)
+        if kind is not None and not kind.__module__.startswith("sb3_dreamer_urlb."):
+            found[argument] = OwnPart(f"{kind.__module__}.{kind.__qualname__}", name)
     return found

@@ -10,9 +10,7 @@ import gymnasium
 from sb3_dreamer_urlb.hub.facts import ModelFacts, OwnPart
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.snapshots import values
-
-#: by argument, what makes a name known
-REGISTERING = {"planner": "register_planner", "intrinsic_reward": "register_intrinsic_reward"}
+from sb3_dreamer_urlb.snapshots.registered import ANOTHER, registries
 
 
 def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
@@ -80,8 +78,8 @@ def how_to_give(parts: dict[str, OwnPart]) -> list[str]:
         if part.registered_as is None:
             how = f'load(..., custom_objects={{"{argument}": {name}}})'
         else:
-            how = f'{REGISTERING[argument]}("{part.registered_as}", {name}) first'
-        other = ', or load(..., planner="dyna_mpc")' if argument == "planner" else ""
+            how = f'{registries()[argument].register}("{part.registered_as}", {name}) first'
+        other = f", or {ANOTHER[argument]}" if argument in ANOTHER else ""
         lines += [f"# Its {argument} is {part.kind}, which this package does not have:", f"# {how}{other}."]
     return lines
 

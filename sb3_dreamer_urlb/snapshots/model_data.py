@@ -5,19 +5,19 @@ from __future__ import annotations
 import re
 import warnings
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.intrinsic import ExplorationMethod, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
-from sb3_dreamer_urlb.planning import Planner, registered_planners
+from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.signatures import constructed, named_parameters
 from sb3_dreamer_urlb.snapshots import values
 from sb3_dreamer_urlb.snapshots.random_state import capture
+from sb3_dreamer_urlb.snapshots.registered import check_registered, or_another
 from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm, public_algorithms, without_networks
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
@@ -34,8 +34,6 @@ FIELDS = {
 KEPT = {"actor", "critic", "reward"}
 #: arguments that every constructor of an algorithm takes in front
 FIRST = ("policy", "env")
-#: what can be done where an argument cannot be had again
-OTHERWISE = {"planner": ', or another one: load(..., planner="dyna_mpc")'}
 MAX_ENVS = 65_536
 #: whose statistics are kept
 MAX_EPISODES = 1000
@@ -117,7 +115,7 @@ def blank(
     _check_method(arguments, given)
     if isinstance(given.get("planner"), Planner):
         given.setdefault("planner_kwargs", None)  # those stored belong to the one that it replaces
-    _check_registered(arguments, given)
+    check_registered(arguments, given)
     # A stored value that is replaced need not be one that can be read here.
     decoded = {
         name: values.decode(value) for name, value in arguments.items() if name not in given or name.endswith("_kwargs")
@@ -128,7 +126,7 @@ def blank(
         if (missing := values.contains_custom(value)) is not None:
             raise ValueError(
                 f"its {name} was {missing.description}, which no file can hold; "
-                f"give it again: load(..., custom_objects={{{name!r}: ...}}){OTHERWISE.get(name, '')}"
+                f"give it again: load(..., custom_objects={{{name!r}: ...}}){or_another(name)}"
             )
         if name in CHECKS and name not in given and not CHECKS[name](value):
             raise ValueError(f"its {name} is {str(value)[:80]!r}")
@@ -217,24 +215,6 @@ def _check_method(stored: dict[str, Any], given: dict[str, Any]) -> None:
     was, wanted = values.decode(stored.get("intrinsic_reward")), given.get("intrinsic_reward")
     if "intrinsic_reward" in given and all(one is None or isinstance(one, str) for one in (was, wanted)) and was != wanted:
         raise ValueError(f"intrinsic_reward must be {was!r}, with which the model was trained, got {wanted!r}.")
-
-
-def _check_registered(stored: dict[str, Any], given: dict[str, Any]) -> None:
-    """
-    :raises ValueError: for a name that whoever saved the model registered, and nobody here
-    """
-    registries: dict[str, tuple[str, Collection[str]]] = {
-        "planner": ("register_planner", registered_planners()),
-        "intrinsic_reward": ("register_intrinsic_reward", registered_intrinsic_rewards(ExplorationMethod)),
-    }
-    for argument, (register, known) in registries.items():
-        value = stored.get(argument)
-        name = value.get("name") if isinstance(value, dict) and value.get(values.TAG) in values.BY_NAME else value
-        if argument not in given and isinstance(name, str) and name not in known:
-            raise ValueError(
-                f"its {argument} is {name!r}, which is not registered here; known are {sorted(known)}. First "
-                f"{register}({name!r}, ItsClass){OTHERWISE.get(argument, '')}"
-            )
 
 
 def needed(data: dict[str, Any]) -> list[str]:
