@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from fake_envs import CounterEnv
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2, EvaluationCallback, RunCheckpointCallback, SnapshotCallback, VideoCallback
+from sb3_dreamer_urlb.analysis.study_settings import remember
+from sb3_dreamer_urlb.analysis.trajectories import save_trajectories
+from sb3_dreamer_urlb.cli.methods_tour import TourConfig, run_tour
+from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.folders import check_folder, made_folder
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
 
@@ -26,6 +32,11 @@ TAKERS = {
         1, callback=EvaluationCallback(CounterEnv(), best_model_save_path=path)
     ),
     "log_path": lambda path: model().learn(1, callback=EvaluationCallback(CounterEnv(), log_path=path)),
+    "the folder of a file": lambda path: model().save(f"{path}/model.zip"),
+    "the folder of the rows": lambda path: append_rows(f"{path}/rows.csv", []),
+    "--out": lambda path: run_tour(TourConfig(out=Path(path))),
+    "folder, of trajectories": lambda path: save_trajectories([], path),
+    "folder, of a study": lambda path: remember(Path(path), {}),
 }
 
 

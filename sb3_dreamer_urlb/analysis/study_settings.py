@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 #: in the folder of a study
@@ -39,7 +40,7 @@ def remember(folder: Path, settings: dict[str, Any]) -> None:
     :param folder: of a study, made if it is not there
     :param settings: of its runs
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    made_folder("folder", folder)
     if not (folder / FILE).exists():
         with written_atomically(folder / FILE) as file:
             file.write((json.dumps(_plain(settings), indent=1, sort_keys=True) + "\n").encode())

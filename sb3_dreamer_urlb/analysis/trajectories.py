@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import SequenceBatch
 
@@ -129,8 +130,7 @@ def save_trajectories(trajectories: Sequence[Trajectory], folder: str | os.PathL
     :param trajectories: to write
     :param folder: made if it is not there
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = made_folder("folder", folder)
     for i, one in enumerate(trajectories):
         seen = one.observations
         named = {f"{OBSERVATION}/{k}": v for k, v in seen.items()} if isinstance(seen, dict) else {OBSERVATION: seen}

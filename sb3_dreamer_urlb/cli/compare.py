@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb.folders import made_folder
+
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.tables import Table
 
@@ -68,7 +70,7 @@ def compare_runs(groups: Mapping[str, Sequence[Path]], out: Path, tag: str | Non
 
     facts = {label: [read_run(folder) for folder in folders] for label, folders in groups.items()}
     picture, table, settings = compare(facts, tag, TAGS)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    made_folder("the folder of --out", out.parent)
     picture.name = out.stem
     paths = picture.write(out.parent)
     page = compare_page(" against ".join(groups), embedded_png(paths[1]), picture.caption, settings, table)

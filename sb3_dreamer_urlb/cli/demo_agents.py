@@ -22,6 +22,7 @@ from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.episodes import OFF, ON, run_evaluation
 from sb3_dreamer_urlb.evaluation.recording import record
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize, save_vec_normalize
 
 #: frames of a film, and its side in pixels
@@ -84,7 +85,7 @@ def explore(agent: Agent) -> Path:
     :param agent: what to do
     :return: the snapshot; the statistics of its observations lie beside it
     """
-    agent.folder.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", agent.folder)
     model = _new_model(agent, agent.seed, intrinsic_reward="lbs")
     _learn(agent, model)
     for optimizer in model.learner.optimizers().values():
@@ -99,7 +100,7 @@ def learn_task(agent: Agent) -> Path:
     :param agent: what to do
     :return: the snapshot
     """
-    agent.folder.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", agent.folder)
     if agent.snapshot is None:
         model = _new_model(agent, 1000 + agent.seed)
     else:

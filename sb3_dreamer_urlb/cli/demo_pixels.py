@@ -24,6 +24,7 @@ from sb3_dreamer_urlb.evaluation.append import append_row
 from sb3_dreamer_urlb.evaluation.episodes import SEED, Evaluation
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.scores import oracle
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_positive
 from sb3_dreamer_urlb.words import counted
 
@@ -93,7 +94,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     """
     figures.check_plots_installed()
     began = time.time()
-    config.out.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", config.out)
 
     env = gymnasium.make(f"urlb/{config.task}-v0", fast_render=config.fast_render, render_mode="rgb_array")
     config = fitted(config, env)

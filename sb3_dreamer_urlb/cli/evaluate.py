@@ -14,6 +14,7 @@ from sb3_dreamer_urlb.cli.agents import (
     pairs,
     typed,
 )
+from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.episodes import Evaluation
@@ -58,7 +59,7 @@ def run(options: dict[str, Any]) -> int:
     if "rows" in options:
         check_can_append(options["rows"])
     if "npz" in options:
-        options["npz"].mkdir(parents=True, exist_ok=True)
+        made_folder("--npz", options["npz"])
     model, env = load_agent(options, envs)
     if "rows" in options and model.seed is None and "seed" not in about:
         env.close()

@@ -12,6 +12,8 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb.folders import made_folder
+
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.arms import Study
     from sb3_dreamer_urlb.evaluation.rows import Row
@@ -88,7 +90,7 @@ def run(options: dict[str, Any]) -> int:
         print(f"{runs} no evaluation {where}, left out:", file=sys.stderr)
         for row in study.unfinished:
             print(f"  {row}", file=sys.stderr)
-    options["out"].mkdir(parents=True, exist_ok=True)
+    made_folder("--out", options["out"])
     tables, pictures, missing = _made(study, options)
     _say_what_is_shown_nowhere(study)
     written = _write(tables, pictures, missing, options["out"])

@@ -21,6 +21,7 @@ from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.evaluation.scores import oracle
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, make_intrinsic_reward, registered_intrinsic_rewards
 from sb3_dreamer_urlb.number_checks import check_positive
 
@@ -181,7 +182,7 @@ def run_tour(config: TourConfig) -> list[Visit]:
 
     :param config: what to do
     """
-    config.out.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", config.out)
     methods = config.methods or tuple(registered_intrinsic_rewards())
     print(_row(*COLUMNS), flush=True)
     visits = []

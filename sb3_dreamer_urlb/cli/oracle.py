@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb.cli.agents import add_statistics_argument
+from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.analysis.trajectories import Trajectory
@@ -43,7 +44,7 @@ def check_oracle_options(options: dict[str, Any]) -> None:
     if "oracle" not in options and "trajectories" not in options:
         raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
     if "oracle" in options and "trajectories" in options:
-        options["trajectories"].mkdir(parents=True, exist_ok=True)
+        made_folder("--trajectories", options["trajectories"])
     if "rows" in options:
         if not options["rows"].exists():
             raise FileNotFoundError(f"There is no file {options['rows']} of evaluations: evaluate the fine-tuned agent first.")

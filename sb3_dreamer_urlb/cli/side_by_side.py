@@ -22,6 +22,7 @@ from sb3_dreamer_urlb.envs.registration import PRIMAL_TASK, URLB_TASKS, env_id
 from sb3_dreamer_urlb.evaluation.figures import check_plots_installed
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_integer, check_positive
 from sb3_dreamer_urlb.words import counted, mean_and_spread
 
@@ -84,7 +85,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     """
     check_plots_installed()
     began = time.time()
-    config.out.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", config.out)
     config = fitted(config)
     agents = _agents(config)
     for agent in agents.values():

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, WRITTEN, Row, header, line_of, lines_of, parse, read_rows, texts
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 
@@ -28,7 +29,7 @@ def check_can_append(path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give a CSV file for the rows.")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder("the folder of the rows", path.parent)
     with _locked(path):
         if path.exists():
             # Not "w": what is there stays.
@@ -66,7 +67,7 @@ def append_rows(path: str | os.PathLike[str], rows: Iterable[Row]) -> int:
     path = Path(path)
     # To and fro: what cannot be read back is not written.
     rows = [parse(texts(row), strict=False) for row in rows]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder("the folder of the rows", path.parent)
     with _locked(path):
         # What is there may be about things that a reader would refuse: it is not ours to judge here.
         there = path.exists() and path.stat().st_size > 0

@@ -79,8 +79,8 @@ class PlannerConfig:
             raise ValueError(f"planner min_std must lie in (0, {MAX_STD:g}], got {self.min_std!r}.")
         if self.top_k > self.n_samples + self.actor_trajectories:
             raise ValueError(
-                f"planner top_k must be at most the number of trajectories "
-                f"({self.n_samples} + {self.actor_trajectories}), got {self.top_k}."
+                f"planner top_k must be at most the number of trajectories (n_samples={self.n_samples} and "
+                f"{self.actor_trajectories} of the actor's), got {self.top_k}: fewer samples go with a smaller top_k."
             )
 
     @property

@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from sb3_dreamer_urlb.folders import check_folder
+
 TEMPORARY = ".tmp"
 
 
@@ -19,9 +21,11 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     :param path: missing folders are made
     :return: binary file to write to
+    :raises NotADirectoryError: if a file is where a folder is needed, naming it
     :raises OSError: naming ``path``
     """
     path = Path(path)
+    check_folder("the folder of a file", path.parent)
     # The process's number keeps two writers apart; a leftover of a killed process of the same number is overwritten.
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
     try:

@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         from sb3_dreamer_urlb.zoo import plotting
         from sb3_dreamer_urlb.zoo.found_runs import that_says_what_there_is
-        from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line, with_values_named
+        from sb3_dreamer_urlb.zoo.mistakes import error_in_a_line, told_in_a_line, with_values_named
         from sb3_dreamer_urlb.zoo.playing import Played
         from sb3_dreamer_urlb.zoo.registration import register
         from sb3_dreamer_urlb.zoo.resuming import with_runs
@@ -72,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with (
         told_in_a_line(sys.argv[0]),
         mock.patch.object(argparse.ArgumentParser, "parse_args", parse_args),
+        mock.patch.object(argparse.ArgumentParser, "error", error_in_a_line),
         mock.patch("rl_zoo3.utils.get_model_path", that_says_what_there_is(rl_zoo3.utils.get_model_path, sys.argv[0])),
         mock.patch("rl_zoo3.create_test_env", played.counting(rl_zoo3.create_test_env)),
     ):

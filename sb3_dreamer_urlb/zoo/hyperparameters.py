@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 from collections.abc import Iterable, Iterator
@@ -52,6 +53,7 @@ def check(hyperparams: dict[str, Any], algorithm: str, arguments: Iterable[str])
         check_integer(name, hyperparams[name], 1)
     for key, filled_in in CLASSES.items():
         _check_classes(key, hyperparams.get(key), filled_in)
+    _check_normalize(hyperparams.get("normalize"))
     policy = hyperparams.get("policy", "")
     if not isinstance(policy, str | type):
         raise ValueError(f"policy must be the name of one, as CnnPolicy, got {policy!r}.")
@@ -77,6 +79,20 @@ def check_evaluated(normalize: Any, monitor_kwargs: Any) -> None:
         if not isinstance(given, dict):
             raise ValueError(f"{key} must be keyword arguments of {kind.__name__}, got {given!r}.")
         check_keys(key, given, named_parameters(kind).keys() - filled_in)
+
+
+def _check_normalize(normalize: Any) -> None:
+    """rl_zoo3 puts gamma into what it has read, and finds out there that it is no dictionary."""
+    if not isinstance(normalize, str):
+        return
+    try:
+        read = ast.literal_eval(normalize)
+    except (SyntaxError, ValueError):
+        return  # for Python to say, which evaluates more than literals
+    if not isinstance(read, dict):
+        raise ValueError(
+            f"normalize must be true, false or keyword arguments of VecNormalize in quotation marks, got the text {normalize!r}."
+        )
 
 
 def _check_steps(steps: Any) -> None:

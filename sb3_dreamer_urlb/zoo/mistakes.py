@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NoReturn
 from unittest import mock
 
 import yaml
@@ -119,3 +119,13 @@ def with_values_named(parse: Callable[..., argparse.Namespace]) -> Callable[...,
             )
 
     return parse_args
+
+
+def error_in_a_line(parser: argparse.ArgumentParser, message: str) -> NoReturn:
+    """``ArgumentParser.error`` without the usage before it: rl_zoo3 has so many options that it would hide what is wrong.
+
+    :param parser: whose options were wrong
+    :param message: what was wrong
+    :raises SystemExit: 2
+    """
+    parser.exit(2, f"{parser.prog}: error: {message} ({parser.prog} --help lists the options)\n")

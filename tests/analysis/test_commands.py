@@ -106,7 +106,8 @@ def test_options_that_ask_for_nothing(snapshots, capsys):
     [
         ("--rows {folder}", "is a folder"),
         ("--rows {other}", "lacks the columns"),
-        ("--npz {other}", "File exists"),
+        ("--npz {other}", "--npz must be the path of a folder"),
+        ("--rows {other}/rows.csv", "the folder of the rows must be the path of a folder"),
         ("--rows {folder}/rows.csv --set method=xyz", "unknown method 'xyz'"),
         ("--rows {folder}/rows.csv --set return_mean=900", "--set return_mean: the evaluation measures that"),
         ("--rows {folder}/rows.csv --set planner=mppi", "--set planner: the evaluation measures that"),

@@ -281,6 +281,17 @@ def test_mistakes_are_named(zoo, monkeypatch, capsys):
         main(["dance"])
 
 
+@pytest.mark.parametrize(
+    ("option", "said"), [("--seed=x", "argument --seed: invalid int value: 'x'"), ("--sede=1", "arguments: --sede=1")]
+)
+def test_a_wrong_option_is_not_hidden_by_all_the_others(zoo, capsys, option, said):
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match=r"^2$"):
+        train(zoo, STAND, 8, "lbs", option)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line and "zoo train --help lists" in line
+
+
 SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
 
 
@@ -299,6 +310,7 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("n_envs:'two'", "n_envs must be an integer of at least 1, got 'two'"),
         ("frame_stack:0", "frame_stack must be an integer of at least 1, got 0"),
         ("normalize:'yes please'", "A value that is read as Python cannot be"),
+        ("normalize:'True'", "normalize must be true, false or keyword arguments of VecNormalize in quotation marks, got the text"),
         ("policy:'CnnPolcy'", "Unknown policy 'CnnPolcy'"),
         (
             "polcy:'MlpPolicy'",
