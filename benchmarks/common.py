@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import get_device
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dreamer_urlb import DreamerV2, native
-from sb3_dreamer_urlb.algorithm.updates_due import NoUpdateWarning
+from sb3_dreamer_urlb.algorithm.advice import NoUpdateWarning
 from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
 
 

@@ -18,6 +18,7 @@ import json
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stopwatch import OTHER, Stopwatch
 
 from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.algorithm.advice import NoUpdateWarning
 from sb3_dreamer_urlb.envs import DOMAINS, PRIMAL_TASK, URLB_TASKS, SupervisedVecEnv, make_urlb_env
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 
@@ -66,7 +68,10 @@ def make_phase(options: argparse.Namespace) -> tuple[DreamerV2, dict[str, int]]:
         model = DreamerV2("CnnPolicy", env, **kwargs)
     else:
         model = DreamerV2.load(options.snapshot, env, device=options.device)
-        model.fine_tune()
+        with warnings.catch_warnings():
+            # How long it takes does not depend on what was learnt.
+            warnings.simplefilter("ignore", NoUpdateWarning)
+            model.fine_tune()
     own = {name: getattr(model, name) for name in ("learning_starts", "planner_delay", "buffer_size")}
     own["train_freq"] = model.train_freq.frequency  # type: ignore[union-attr]
     if options.only == "pre-training":

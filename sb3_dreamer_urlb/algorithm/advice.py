@@ -13,6 +13,10 @@ from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS
 IMAGES, VECTORS = "images", "vectors"
 
 
+class NoUpdateWarning(UserWarning):
+    """Networks stay as fresh as they began, or are transferred so: who means it can filter this."""
+
+
 def warn_if_nothing_was_learnt(model: Any) -> None:
     """Where a fine-tuning begins with networks that are as fresh as new ones.
 
@@ -21,7 +25,8 @@ def warn_if_nothing_was_learnt(model: Any) -> None:
     if model._n_updates == 0:
         warnings.warn(
             f"fine_tune() keeps what a pre-training has learnt, and this one has had no update in {model.phase_frames} "
-            "frames: load a pre-trained snapshot, or learn() first."
+            "frames: load a pre-trained snapshot, or learn() first.",
+            NoUpdateWarning,
         )
 
 

@@ -4,33 +4,26 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Mapping
 from contextlib import ExitStack
 from typing import Any, TypeVar
 
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb import phases, transfer_rule
-from sb3_dreamer_urlb.algorithm import advice, checks, left_environments, normalized, training_loop
-from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
-from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
-from sb3_dreamer_urlb.algorithm.environment_checks import check_env, needed_env
+from sb3_dreamer_urlb.algorithm import advice, checks, normalized, training_loop
+from sb3_dreamer_urlb.algorithm.environment_checks import needed_env
+from sb3_dreamer_urlb.algorithm.environments import EnvironmentAlgorithm
 from sb3_dreamer_urlb.algorithm.updates_due import UpdatesDue
 from sb3_dreamer_urlb.devices import chosen_device
-from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
-from sb3_dreamer_urlb.envs.normalized import watch_ends
-from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
 from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
-from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots.saved_algorithm import builds_networks
 from sb3_dreamer_urlb.types import MetricMeans
 from sb3_dreamer_urlb.unknown_names import did_you_mean
@@ -38,11 +31,11 @@ from sb3_dreamer_urlb.unknown_names import did_you_mean
 SelfPhasedAlgorithm = TypeVar("SelfPhasedAlgorithm", bound="PhasedAlgorithm")
 
 
-class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
+class PhasedAlgorithm(EnvironmentAlgorithm):
     """An off-policy algorithm that pre-trains with an intrinsic reward and fine-tunes on a task (paper §2, §3).
 
     The base of every algorithm here, as Stable-Baselines3's ``OffPolicyAlgorithm`` is of SAC. Here is what
-    does not depend on how an agent learns: phases and their counters, what the environment tells, ``learn``, faults, files.
+    does not depend on how an agent learns: phases and their counters, ``learn``, faults.
     A subclass says, in the order in which they happen:
 
     - :meth:`_prepare`: what follows from the arguments before anything is built;
@@ -60,9 +53,6 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     :param preset: name of the set of hyperparameters that filled in what the caller left out
     :param kwargs: of SB3's ``OffPolicyAlgorithm``
     """
-
-    #: whether :meth:`set_env` is at work, which assigns
-    _sets_env = False
 
     def __init__(
         self,
@@ -156,82 +146,19 @@ class PhasedAlgorithm(AssignableArguments, CollectingAlgorithm):
     def _guard(self) -> UpdateGuard | None:
         """What counts the present optimisers' skipped updates; None before there are any."""
 
-    # -- environments --------------------------------------------------------------------------------------------------
-
-    @staticmethod
-    def _wrap_env(env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = CollectingAlgorithm._wrap_env(checks.given_env(env), verbose, monitor_wrapper)
-        checks.check_keeps_fractions(wrapped)
-        return wrapped
-
-    def prepare_env(self, env: GymEnv | str) -> VecEnv:
-        """Wrap an environment as SB3 does, and check that this model can go on in it.
-
-        :param env: vectorised or not, or its id
-        :raises ValueError: if it does not fit
-        """
-        wrapped = self._wrap_env(env, self.verbose)
-        self._check_env(wrapped)
-        return wrapped
+    # -- phases --------------------------------------------------------------------------------------------------------
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """As ever; another environment that is assigned is set, as by :meth:`set_env`.
+        """As ever.
 
         :raises AttributeError: for another phase, which only :meth:`fine_tune` makes
         """
-        if name == "env" and "policy" in vars(self) and not (self._sets_env or value is None or value is self.env):
-            self.set_env(value)
-        elif name == "phase" and "policy" in vars(self) and value != self.phase:
+        if name == "phase" and "policy" in vars(self) and value != self.phase:
             raise AttributeError(
                 f"phase cannot be assigned, got {value!r}: the networks are those of {self.phase!r}. fine_tune() leaves the "
                 "pre-training."
             )
-        else:
-            super().__setattr__(name, value)
-
-    def _check_env(self, env: VecEnv) -> None:
-        check_env(self, env)
-
-    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
-        """As SB3's; also checks what else the model needs of it, and reads the new environment's action repeat.
-
-        :param env: with the model's number of environments and its spaces; an id makes one
-        :param force_reset: reset it before going on; False does not if it stands where the model left it, wrapped as then
-        :raises ValueError: if it does not fit; the model stays as it is
-        """
-        wrapped, known = self.prepare_env(env), self._known_statistics()
-        self._sets_env = True
-        try:
-            super().set_env(wrapped, force_reset)
-        finally:
-            self._sets_env = False
-        if left_environments.found(wrapped) is None:
-            # What was seen last, was seen elsewhere, or through other wrappers.
-            self._last_obs = None
-        self._read_env()
-        self._go_on_normalized(known)
-
-    def _known_statistics(self) -> Mapping[str, th.Tensor]:
-        """Of the VecNormalize that the model has learnt behind."""
-        return self.loaded_statistics if self.env is None else normalization.pack(self._vec_normalize_env)
-
-    def _go_on_normalized(self, known: Mapping[str, th.Tensor]) -> None:
-        if max(self.phase_timesteps, self.num_timesteps) > 0:
-            normalized.go_on(known, self._vec_normalize_env)
-
-    def _read_env(self) -> None:
-        """What the environment tells about itself beyond its spaces."""
-        if self.env is None:
-            return
-        # Watched from now on, also while others step it.
-        last_touches(self.env)
-        if self._vec_normalize_env is not None:
-            watch_ends(self._vec_normalize_env)
-        self.action_repeat = env_fact(self.env, "action_repeat", 1)
-        self.domain = env_fact(self.env, "domain", None)
-        advice.warn_if_no_episode_fits(self)
-
-    # -- phases --------------------------------------------------------------------------------------------------------
+        super().__setattr__(name, value)
 
     def fine_tune(
         self,

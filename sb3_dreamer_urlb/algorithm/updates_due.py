@@ -7,11 +7,8 @@ import warnings
 
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
+from sb3_dreamer_urlb.algorithm.advice import NoUpdateWarning
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
-
-
-class NoUpdateWarning(UserWarning):
-    """A ``learn`` that begins will teach nothing: who means it so can filter this."""
 
 
 class UpdatesDue:
@@ -45,7 +42,8 @@ class UpdatesDue:
         if model.phase_timesteps > model.learning_starts:
             why = f"and the replay still waits for {model.replay_buffer.waits_for}."
         warnings.warn(
-            f"learn() has ended without an update, after {model.phase_timesteps} agent steps of {model.phase}, {why}"
+            f"learn() has ended without an update, after {model.phase_timesteps} agent steps of {model.phase}, {why}",
+            NoUpdateWarning,
         )
 
     @property

@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_dreamer_urlb.algorithm.updates_due import NoUpdateWarning
+from sb3_dreamer_urlb.algorithm.advice import NoUpdateWarning
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.envs import RenderingBackendError
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of

@@ -91,7 +91,7 @@ def _check_normalize(normalize: Any) -> None:
         return  # for Python to say, which evaluates more than literals
     if not isinstance(read, dict):
         raise ValueError(
-            f"normalize must be true, false or keyword arguments of VecNormalize in quotation marks, got the text {normalize!r}."
+            f"normalize must be true, false, or keyword arguments of VecNormalize as a text, got the text {normalize!r}."
         )
 
 

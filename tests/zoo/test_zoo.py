@@ -310,7 +310,7 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("n_envs:'two'", "n_envs must be an integer of at least 1, got 'two'"),
         ("frame_stack:0", "frame_stack must be an integer of at least 1, got 0"),
         ("normalize:'yes please'", "A value that is read as Python cannot be"),
-        ("normalize:'True'", "normalize must be true, false or keyword arguments of VecNormalize in quotation marks, got the text"),
+        ("normalize:'True'", "normalize must be true, false, or keyword arguments of VecNormalize as a text, got"),
         ("policy:'CnnPolcy'", "Unknown policy 'CnnPolcy'"),
         (
             "polcy:'MlpPolicy'",
