@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
-from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS
+from sb3_dreamer_urlb.replay.episode_buffer import MAX_EPISODE_ROWS
 
 #: what presets are made for
 IMAGES, VECTORS = "images", "vectors"

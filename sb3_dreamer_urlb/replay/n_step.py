@@ -17,9 +17,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.replay import gathering, stores
 from sb3_dreamer_urlb.replay.device_store import OnItsWay
+from sb3_dreamer_urlb.replay.episode_buffer import MAX_EPISODE_ROWS
 from sb3_dreamer_urlb.replay.rows import observation_of
 from sb3_dreamer_urlb.replay.sampling import BY_ROW, Pieces
-from sb3_dreamer_urlb.replay.sequence_buffer import MAX_EPISODE_ROWS, SequenceReplayBuffer
+from sb3_dreamer_urlb.replay.sequence_buffer import SequenceReplayBuffer
 from sb3_dreamer_urlb.replay.windows import draw_windows
 from sb3_dreamer_urlb.types import Observation, StepBatch, map_observation
 
