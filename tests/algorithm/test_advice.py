@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 
 import gymnasium
@@ -12,6 +11,7 @@ import pytest
 import yaml
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2
 from sb3_dreamer_urlb.algorithm.advice import IMAGES, VECTORS
@@ -28,10 +28,9 @@ each = pytest.mark.parametrize("algorithm", [DreamerV2, DrQv2])
 
 def told(make):
     """The model that ``make`` makes, and what it warns of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as said:
         model = make()
-    return model, [str(one.message) for one in caught]
+    return model, said
 
 
 def seeing(space, length=None):

@@ -1,23 +1,21 @@
 """Whoever asks for a learn() that cannot learn is told."""
 
-import warnings
-
 import pytest
 from fake_envs import CounterEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DrQv2
 
 
 def told(model, steps: int, callback=None) -> list[str]:
     """What learn() warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as told_now:
         model.learn(steps, callback)
-    return [str(one.message) for one in caught if "update" in str(one.message)]
+    return [text for text in told_now if "update" in text]
 
 
 class Stops(BaseCallback):
@@ -68,10 +66,9 @@ def test_what_is_only_known_at_the_end(tiny_model):
 def test_a_fine_tuning_of_fresh_networks_says_so(tiny_model, steps):
     model = tiny_model(intrinsic_reward="lbs")
     told(model, steps)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as told_now:
         model.fine_tune()
-    said = [str(one.message) for one in caught if "has had no update in" in str(one.message)]
+    said = [text for text in told_now if "has had no update in" in text]
     assert len(said) == (steps < 40) and all(f"in {steps * model.action_repeat} frames" in one for one in said)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pytest
 from fake_envs import CounterEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
@@ -75,10 +75,9 @@ def test_a_run_that_goes_on_writes_each_row_once(tiny_model: Any, tmp_path: Path
 def test_a_result_that_contradicts_the_file_does_not_end_the_run(tiny_model: Any, tmp_path: Path) -> None:
     for length, warned in ((5, False), (6, True)):
         callback = EvaluationCallback(CounterEnv(length, **WALKER), 20, 1, tmp_path / "rows.csv")
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with told_meanwhile() as said:
             tiny_model(CounterEnv(20, **WALKER)).learn(10, callback=callback)
-        assert any("another result of the same run" in str(one.message) for one in caught) is warned
+        assert any("another result of the same run" in text for text in said) is warned
     assert len(read_rows(tmp_path / "rows.csv").rows) == 1
 
 

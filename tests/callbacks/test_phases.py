@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 import torch as th
@@ -12,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
 from sb3_dreamer_urlb.dreamer_v2.kept_parts import TRANSFER
@@ -311,10 +310,9 @@ def test_a_switch_does_nothing_to_a_run_without_pretraining(tiny_model):
 @pytest.mark.parametrize(("frames", "told"), [(1000, True), (33, True), (32, False), (20, False)])
 def test_a_learn_that_ends_before_the_switch_says_so(tiny_model, frames, told):
     model = tiny_model(vec_env(action_repeat=2), intrinsic_reward="lbs")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as said:
         model.learn(16, callback=PhaseSwitchCallback(frames))
-    messages = [str(one.message) for one in caught if "PhaseSwitchCallback" in str(one.message)]
+    messages = [text for text in said if "PhaseSwitchCallback" in text]
     said = f"ends after 32 frames of pre-training, and PhaseSwitchCallback switches after pretrain_frames={frames}"
     assert len(messages) == told and all(said in message for message in messages)
 

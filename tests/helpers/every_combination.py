@@ -16,6 +16,7 @@ import numpy as np
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerV2, native
 from sb3_dreamer_urlb.learning.graphs import COMPILE
@@ -54,13 +55,12 @@ def main() -> None:
     combinations = [(*its, False) for its in itertools.product(precision.PRECISIONS, COMPILE, PLANNERS, SPACES)]
     combinations += [(*its, True) for its in itertools.product(precision.PRECISIONS, ["native"], PLANNERS, SPACES)]
     for combination in combinations:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with told_meanwhile() as said:
             try:
                 run(*combination)
             except Exception:
                 faults.append(f"{combination}: {traceback.format_exc(limit=-4)}")
-        warned += [f"{combination}: {one.message}" for one in caught if issubclass(one.category, UserWarning)]
+        warned += [f"{combination}: {one}" for one in said]
     print(json.dumps({**found, "faults": faults, "warnings": warned}))
 
 

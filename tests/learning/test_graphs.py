@@ -11,7 +11,6 @@ import copy
 import dataclasses
 import math
 import pickle
-import warnings
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 from tape import CannotRecord, TapeBackend, refusal
+from told import told_meanwhile
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_dreamer_urlb import DreamerV2
@@ -85,8 +85,7 @@ def test_recorded_updates_are_the_same(learner, batch, taped, weights, method):
     recorded.agent.load_state_dict(plain.agent.state_dict())
     backend = recorded.recorder.backend
     expected = run_updates(plain, batch)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as said:
         found = run_updates(recorded, batch)
     assert str(found) == str(expected)  # as text, because NaN is not NaN
     assert weights(recorded.agent) == weights(plain.agent)
@@ -97,11 +96,11 @@ def test_recorded_updates_are_the_same(learner, batch, taped, weights, method):
     assert recorded.guard.total() == plain.guard.total() == 1
     assert recorded.updates == plain.updates == 9
     if method in WAITING:
-        [warning] = caught
-        assert "The update runs without CUDA graphs, slower: aten.index" in str(warning.message)
+        [text] = said
+        assert "The update runs without CUDA graphs, slower: aten.index" in text
         assert recorded.recorder.backend is None
     else:
-        assert caught == [] and len(backend.tapes) == 1 and recorded.recorder.recordings == 1
+        assert said == [] and len(backend.tapes) == 1 and recorded.recorder.recordings == 1
 
 
 def test_an_update_is_recorded_anew_when_it_changes(learner, batch, taped):
@@ -128,11 +127,12 @@ def test_an_update_is_recorded_anew_when_it_changes(learner, batch, taped):
 
 def test_a_method_that_changes_in_python_is_not_recorded(learner, batch, taped, monkeypatch):
     monkeypatch.setattr(LBS, "graph_safe", False)
-    with pytest.warns(UserWarning, match="The update runs without CUDA graphs, slower: LBS.graph_safe is False") as caught:
+    with told_meanwhile() as said:
         its = learner("lbs", compile="cuda_graphs")
         for _ in range(WARM_UPS + 2):
             its.update(batch)
-    assert len(caught) == 1 and its.recorder.recordings == 0
+    [text] = said
+    assert "The update runs without CUDA graphs, slower: LBS.graph_safe is False" in text and its.recorder.recordings == 0
     learner("lbs")  # eager anyway: nothing to warn about
 
 
@@ -307,9 +307,11 @@ def test_what_cannot_be_recorded_runs_with_one_warning():
         return inputs * 2 if float(inputs.sum()) > 0 else inputs
 
     recorder = Recorder(wait, TapeBackend(), list, "Waiting")
-    with pytest.warns(UserWarning, match=r"^Waiting runs without CUDA graphs, slower: aten._local_scalar_dense") as caught:
+    with told_meanwhile() as said:
         found = [recorder(th.full((2,), x)).tolist() for x in (1.0, -1.0) * (WARM_UPS + 2)]
-    assert len(caught) == 1 and found == [[2.0, 2.0], [-1.0, -1.0]] * (WARM_UPS + 2)
+    [text] = said
+    assert text.startswith("Waiting runs without CUDA graphs, slower: aten._local_scalar_dense")
+    assert found == [[2.0, 2.0], [-1.0, -1.0]] * (WARM_UPS + 2)
 
 
 def test_work_found_waiting_while_it_warms_up_is_not_recorded():
@@ -324,20 +326,20 @@ def test_work_found_waiting_while_it_warms_up_is_not_recorded():
         recorder = Recorder(lambda inputs, generator: inputs * 2, Watchful(), list, "Waiting")
         recorder.backend.waits_in = call
         backend = recorder.backend
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with told_meanwhile() as said:
             for _ in range(WARM_UPS + 2):
                 assert recorder(th.ones(2)).tolist() == [2, 2]
-        assert (len(caught) == 1) == refused and (backend.tapes == []) == refused
-        assert not refused or "slower: particles.py:116 waits" in str(caught[0].message)
+        assert (len(said) == 1) == refused and (backend.tapes == []) == refused
+        assert not refused or "slower: particles.py:116 waits" in said[0]
 
 
 def test_what_always_changes_is_not_recorded_again_and_again():
     _, _, recorder = sums()
-    with pytest.warns(UserWarning, match=f"changed {graphs.MAX_SITUATIONS} times") as caught:
+    with told_meanwhile() as said:
         for times in range(2 * graphs.MAX_SITUATIONS):
             recorder({"x": th.ones(2)}, None, (times,))
-    assert len(caught) == 1 and recorder.backend is None
+    [text] = said
+    assert f"changed {graphs.MAX_SITUATIONS} times" in text and recorder.backend is None
 
 
 def test_only_trees_of_tensors_are_recorded():
@@ -355,10 +357,11 @@ def test_which_backend():
 
 
 def test_without_a_gpu_graphs_are_refused_with_a_reason_and_learning_goes_on(tiny_model):
-    with pytest.warns(UserWarning, match="needs a CUDA device, the networks are on 'cpu'") as caught:
+    with told_meanwhile() as said:
         model = tiny_model(CounterEnv(8), compile="cuda_graphs", train_freq=2)
         model.learn(40)
-    assert len([warning for warning in caught if "CUDA" in str(warning.message)]) == 1
+    [text] = [text for text in said if "CUDA" in text]
+    assert "needs a CUDA device, the networks are on 'cpu'" in text
     assert model.learner.updates > 0
 
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from operator_calls import ROUNDING, Calls
 from places import ROOT
 from tape import Tape
+from told import told_meanwhile
 from whole_runs import crash, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import RunCheckpointCallback, native
@@ -241,10 +242,9 @@ def test_a_model_without_a_compiler_learns_as_ever(nowhere, tiny_model, capsys):
     runs = []
     for compile in ("eager", "auto", "native"):
         scramble()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with told_meanwhile() as said:
             model = tiny_model(vec_env(), compile=compile, verbose=1).learn(24)
-        ours = [str(warning.message) for warning in caught if "kernels" in str(warning.message)]
+        ours = [text for text in said if "kernels" in text]
         assert len(ours) == (compile == "native")
         runs.append(everything(model)["weights"])
         reason = "(compile='eager')" if compile == "eager" else "(no C++ compiler)"

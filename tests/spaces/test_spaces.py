@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from gymnasium import spaces
 from planning_forms import StepByStep
 from space_kinds import ACTIONS, OBSERVATIONS, VECTOR
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.nn.distributions import OneHotChoices
@@ -271,10 +271,9 @@ NO_IMAGES = {
 def test_what_may_be_meant_as_an_image_is_not_flattened_silently(tiny_model, name):
     space = spaces.Dict(one={**MAYBE_IMAGES, **NO_IMAGES}[name], two=VECTOR)
     env = CounterEnv(8, observation_space=space)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with told_meanwhile() as told_now:
         tiny_model(env, "MultiInputPolicy")
-    said = [str(one.message) for one in caught if "not as an image" in str(one.message)]
+    said = [text for text in told_now if "not as an image" in text]
     assert len(said) == (name in MAYBE_IMAGES)
     assert all(text.startswith("Observation 'one' is seen as a vector of ") for text in said)
 
