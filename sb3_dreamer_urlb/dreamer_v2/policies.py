@@ -132,7 +132,7 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         )
         self.agent = Agent(world_model, net_arch, intrinsic, explores, self.actions.classes, task_reward)
         self.intrinsic = intrinsic
-        self._planner = planner
+        self._plan_with(planner)
         self.planning = planning
         self.precision = precision
         self.compile_mode = compile
@@ -175,9 +175,14 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         :param planner: None lets the actor act
         """
         self.agent.world_model.gamma = self._constructor_sizes["gamma"] = gamma
-        self._planner = planner
+        self._plan_with(planner)
         # A recording holds the old ones.
         self._recorders = None
+
+    def _plan_with(self, planner: Planner | None) -> None:
+        self._planner = planner
+        if planner is not None:
+            planner.in_use = True
 
     # -- acting --------------------------------------------------------------------------------------------------------
 

@@ -32,7 +32,10 @@ def compare(
     shared = [name for name in wanted if all(run.series.get(name) for _, run in runs)]
     if not shared:
         lacking = [str(run.folder) for _, run in runs if not any(run.series.get(name) for name in wanted)]
-        raise ValueError(f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}.")
+        raise ValueError(
+            f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}. A run logs with "
+            "tensorboard_log=... (--tensorboard-log of the zoo), and what it logs has its name in --tag."
+        )
     name = shared[0]
     unknown = [str(run.folder) for _, run in runs if run.action_repeat is None]
     if unknown and len(unknown) < len(runs):

@@ -13,8 +13,9 @@ import torch as th
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.evaluation.films import labelled_open_loop, truth_model_error
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
-from sb3_dreamer_urlb.evaluation.open_loop import dream, pictures, predict_open_loop
+from sb3_dreamer_urlb.evaluation.open_loop import dream, has_image, image_of, pictures, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
+from sb3_dreamer_urlb.types import Observation
 from sb3_dreamer_urlb.version import how_to_install
 
 MISSING_PLOTS = f"Pictures need matplotlib and pillow; {how_to_install('plots')}."
@@ -89,11 +90,29 @@ def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: 
     :param episode: what really happened
     :param start: first observation that the model sees
     :param steps: predicted steps
-    :return: truth and prediction, both uint8 (CONTEXT + steps, height, width, C)
+    :return: truth and prediction, both uint8 (CONTEXT + steps, height, width, 3); of Dicts the first image
+    :raises ValueError: if the agent sees no images, or the episode is too short
     """
-    seen = th.as_tensor(episode.observations).permute(0, 3, 1, 2)
-    truth, predicted = predict_open_loop(policy, seen, episode.actions, start, CONTEXT, steps)
-    return pictures(truth), pictures(predicted)
+    truth, predicted = predict_open_loop(policy, _seen(policy, episode), episode.actions, start, CONTEXT, steps)
+    return _pictures(policy, truth), _pictures(policy, predicted)
+
+
+def _seen(policy: DreamerPolicy, episode: PlayedEpisode) -> Observation:
+    """An episode's observations as the policy takes them, on its device.
+
+    :raises ValueError: if there is no image in them
+    """
+    if not has_image(policy.observations):
+        raise ValueError(f"Pictures of predictions need an agent that sees images, this one sees {policy.observation_space}.")
+    seen: Observation = policy.obs_to_tensor(episode.observations)[0]
+    return seen
+
+
+def _pictures(policy: DreamerPolicy, observation: Observation) -> np.ndarray:
+    """The image in preprocessed observations, as :func:`pictures`."""
+    image = image_of(policy.observations, observation)
+    assert image is not None
+    return pictures(image)
 
 
 def open_loop_errors(
@@ -107,17 +126,17 @@ def open_loop_errors(
     :param steps: predicted steps
     :param path: of the PNG
     :return: root mean square error of each picture, in grey levels of 255, and the predicted rewards, float (CONTEXT + steps,)
+    :raises ValueError: as :func:`open_loop`
     """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    seen = th.as_tensor(episode.observations).permute(0, 3, 1, 2)
-    truth, features = dream(policy, seen, episode.actions, start, CONTEXT, steps)
+    truth, features = dream(policy, _seen(policy, episode), episode.actions, start, CONTEXT, steps)
     with th.no_grad():
         model = policy.agent.world_model
-        difference = (pictures(model.decoder(features)).astype(float) - pictures(truth)) ** 2
+        difference = (_pictures(policy, model.decoder(features)).astype(float) - _pictures(policy, truth)) ** 2
         rewards = model.reward(features).cpu().numpy().reshape(-1)
     errors = np.sqrt(difference.mean((1, 2, 3)))
     shown = np.arange(len(errors)) - CONTEXT + 1

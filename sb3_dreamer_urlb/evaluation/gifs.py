@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number
+
 #: viewers show anything shorter than two hundredths of a second at their own, slower speed
 LEAST_MILLISECONDS = 20
 
@@ -18,9 +20,15 @@ def encode_gif(frames: Sequence[np.ndarray] | np.ndarray, fps: float, scale: int
     :param fps: frames a second
     :param scale: enlarge each pixel this many times
     :raises ImportError: if pillow is not installed
+    :raises ValueError: without frames, or for a rate or a scale that are not positive
     """
     from PIL import Image
 
+    if len(frames) == 0:
+        raise ValueError("An animation needs at least one frame, got none.")
+    if not is_finite_number(fps) or fps <= 0:
+        raise ValueError(f"fps must be a positive number, got {fps!r}.")
+    check_integer("scale", scale, 1)
     images = [Image.fromarray(np.ascontiguousarray(frame)) for frame in frames]
     size = (images[0].width * scale, images[0].height * scale)
     images = [image.resize(size, Image.Resampling.NEAREST) for image in images]

@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
+from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.spaces.observations import DictObservations, Images, Observations
 from sb3_dreamer_urlb.types import LatentState, Observation, batch_size, map_observation
 
@@ -32,8 +33,11 @@ def dream(
     :param context: observations that it sees
     :param steps: observations that it predicts after them, fewer where the episode ends
     :return: the truth, preprocessed, float (context + steps, …), and the features, float (context + steps, F)
-    :raises ValueError: if the episode has no observation after the context
+    :raises ValueError: if the episode has no observation after the context, or for numbers that make no sense
     """
+    check_integer("start", start, 0)
+    check_integer("context", context, 1)
+    check_integer("steps", steps, 1)
     model, device = policy.agent.world_model, policy.device
     end = min(start + context + steps, batch_size(seen))
     if end <= start + context:

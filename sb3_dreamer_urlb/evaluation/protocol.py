@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
+
+from sb3_dreamer_urlb.number_checks import plain
 
 
 class RandomPolicy:
@@ -36,14 +39,14 @@ class RandomPolicy:
 class PlayedEpisode:
     """One episode as it was played.
 
-    :param observations: uint8 (steps + 1, height, width, C)
+    :param observations: as the environment gave them, (steps + 1, …), by name for Dicts
     :param actions: as the environment received them, float (steps, A)
     :param total_reward: undiscounted return
     :param frames: large pictures, uint8, empty unless asked for
     :param rewards: of each step, float (steps,)
     """
 
-    observations: np.ndarray
+    observations: np.ndarray | dict[str, np.ndarray]
     actions: np.ndarray
     total_reward: float
     frames: list[np.ndarray] = field(default_factory=list)
@@ -61,7 +64,7 @@ def play_episode(
     :param deterministic: handed to ``predict``
     :param render: also keep ``env.render()`` after each step
     """
-    observation, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=plain(seed))
     observations, actions, frames, rewards = [observation], [], [], []
     state: Any = None
     done = False
@@ -76,7 +79,14 @@ def play_episode(
         actions.append(action)
         if render:
             frames.append(np.asarray(env.render()))
-    return PlayedEpisode(np.stack(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
+    return PlayedEpisode(_stacked(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
+
+
+def _stacked(observations: Sequence[Any]) -> np.ndarray | dict[str, np.ndarray]:
+    """Observations in a row, those of Dicts by name."""
+    if isinstance(observations[0], dict):
+        return {name: np.stack([one[name] for one in observations]) for name in observations[0]}
+    return np.stack(observations)
 
 
 def evaluate(model: PolicyPredictor, env: gymnasium.Env, episodes: int, seed: int = 1000) -> list[float]:

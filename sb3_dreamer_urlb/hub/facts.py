@@ -26,10 +26,12 @@ class OwnPart:
 
     :param kind: its class
     :param registered_as: the name it goes by in the model's file; None where no file can hold it
+    :param instance: whether what no file can hold was an object of the class
     """
 
     kind: str
     registered_as: str | None
+    instance: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def own_parts(model: AgentAlgorithm) -> dict[str, OwnPart]:
     data = describe(model, None)
     stored = {"policy": data["policy"], **data["arguments"]}
     customs = {name: values.contains_custom(values.decode(stored[name])) for name in needed(data) if name in stored}
-    found = {name: OwnPart(custom.description, None) for name, custom in customs.items() if custom is not None}
+    found = {name: OwnPart(its.description, None, its.instance) for name, its in customs.items() if its is not None}
     for argument, registry in registries().items():
         name = registered_name(stored.get(argument))
         kind = None if name is None else registry.kinds.get(name)

@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,8 +26,9 @@ from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.facts import facts_about
 from sb3_dreamer_urlb.hub.repositories import CONFIG, MISSING_HUB, RepoId, check_filename, open_repository
-from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.number_checks import check_integer, plain
 from sb3_dreamer_urlb.snapshots import bounded_json
+from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots.vec_normalize import save_vec_normalize
 
 if TYPE_CHECKING:
@@ -56,8 +57,9 @@ def package_to_hub(
     """Evaluate a model, film it, describe it, and put all of it into a repository.
 
     The repository gets ``<model_name>.zip`` (its own ``save``), ``README.md`` (the model card), ``config.json``,
-    ``results.json``, ``replay.mp4``, and ``vec_normalize.json`` where observations are normalised. Nothing is uploaded if
-    any of it fails, but a film: without pictures there is none, and a warning says so.
+    ``results.json``, ``replay.mp4``, and ``vec_normalize.json`` where observations are normalised. The model there logs
+    nowhere, and keeps its replay in memory: the folders are yours. Nothing is uploaded if any of it fails, but a film:
+    without pictures there is none, and a warning says so.
 
     :param model: trained, a :class:`~sb3_dreamer_urlb.DreamerV2` or a :class:`~sb3_dreamer_urlb.DrQv2`
     :param repo_id: ``"user/name"`` on the Hub; a folder as a ``Path``, ``"./path"``, ``"/path"`` or ``"file:///path"``
@@ -80,6 +82,7 @@ def package_to_hub(
     :raises ImportError: if the extra ``hub`` is not installed
     """
     algorithm = algorithm_of(model)
+    n_eval_episodes, video_length = plain((n_eval_episodes, video_length))
     check_integer("n_eval_episodes", n_eval_episodes, 1)
     check_integer("video_length", video_length, 0)
     check_installed(film=video_length > 0)
@@ -90,9 +93,10 @@ def package_to_hub(
         recording.copy_statistics(model, env)
         env_id = env_id or _id_of(env)
         model_file = check_filename(f"{model_name or name_of_model(env_id, algorithm.zoo)}.zip")
+        _check_extra_files(extra_files or {}, {CARD, CONFIG, RESULTS, FILM, STATISTICS, model_file})
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            model.save(folder / model_file)
+            _save_for_everybody(model, folder / model_file)
             evaluation = _evaluate(model, env, n_eval_episodes, deterministic, progress_bar)
             filmed = video_length > 0 and _film(model, env, video_length, deterministic, folder / FILM)
             normalizer = unwrap_vec_normalize(env)
@@ -201,6 +205,22 @@ def _check_given(
     ]
     if missing:
         raise ValueError(f"package_to_hub needs {'; and '.join(missing)}.")
+
+
+def _check_extra_files(extra_files: Mapping[str, str | os.PathLike[str]], own: Collection[str]) -> None:
+    """
+    :raises ValueError: for files that would take the place of the repository's own
+    """
+    if taken := sorted({os.path.normpath(name) for name in extra_files} & set(own)):
+        raise ValueError(f"extra_files must leave {', '.join(sorted(own))} to package_to_hub, got {', '.join(taken)}.")
+
+
+def _save_for_everybody(model: AgentAlgorithm, path: Path) -> None:
+    """A snapshot without the folders in which the model logs and keeps its replay, which others do not have."""
+    kept = {name: value for name, value in model.replay_buffer_kwargs.items() if name not in ("path", "map_size")}
+    if "path" in model.replay_buffer_kwargs:
+        kept.pop("store", None)
+    model_snapshot.save(model, path, instead={"tensorboard_log": None, "replay_buffer_kwargs": kept})
 
 
 def _spec_of(env: GymEnv | None) -> Any:

@@ -76,7 +76,7 @@ def how_to_give(parts: dict[str, OwnPart]) -> list[str]:
     for argument, part in parts.items():
         name = part.kind.rpartition(".")[2]
         if part.registered_as is None:
-            how = f'load(..., custom_objects={{"{argument}": {name}}})'
+            how = f'load(..., custom_objects={{"{argument}": {name}{"(...)" if part.instance else ""}}})'
         else:
             how = f'{registries()[argument].register}("{part.registered_as}", {name}) first'
         other = f", or {ANOTHER[argument]}" if argument in ANOTHER else ""

@@ -31,6 +31,11 @@ class RewardSource(nn.Module):
         """Whether the reward head learns a reward of this module's own in place of the task's (ICM, RND)."""
         return type(self).replay_reward is not RewardSource.replay_reward
 
+    @property
+    def makes_rewards(self) -> bool:
+        """Whether the actor seeks anything else than the environment's rewards."""
+        return self.labels_replay or type(self).reward is not RewardSource.reward
+
     def loss(self, posterior: Posterior, batch: SequenceBatch) -> tuple[th.Tensor, Metrics] | None:
         """What the module itself learns from a replayed batch; None if there is nothing to learn.
 
@@ -62,11 +67,13 @@ class RewardSource(nn.Module):
 class IntrinsicReward(ExplorationMethod, RewardSource):
     """A reward the agent makes for itself while it pre-trains.
 
-    A subclass takes its hyperparameters in ``__init__`` and makes its networks in :meth:`build`. Then it overrides any of
+    A subclass takes its hyperparameters in ``__init__`` and makes its networks in :meth:`build`. Then it overrides
 
-    - :meth:`loss`: what its networks learn; the learner owns the optimiser,
+    - :meth:`loss`, if there is any: what its networks learn; the learner owns the optimiser,
     - :meth:`reward`: where the reward can be computed in imagination, or
     - :meth:`replay_reward`: where it needs real observations; the world model's reward head then learns it.
+
+    One that overrides neither of the last two is refused, unless it acts at random (``trains_actor = False``).
 
     What snapshots must hold is a parameter or a buffer. See docs/howto/intrinsic_reward.md for an example.
     """

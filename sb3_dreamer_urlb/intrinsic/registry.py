@@ -94,4 +94,9 @@ def _checked(made: Method) -> Method:
         raise ValueError(f"{type(made).__qualname__}.__init__ must call super().__init__() before anything else.")
     if isinstance(made, IntrinsicReward) and made.skills is not None and not isinstance(made, SkillReward):
         raise ValueError(f"{type(made).__qualname__} has skills, so it must be a subclass of SkillReward, which chooses one.")
+    if isinstance(made, IntrinsicReward) and made.trains_actor and not made.makes_rewards:
+        raise ValueError(
+            f"{type(made).__qualname__} makes no reward, and its pre-training would seek the task's: it must override "
+            "reward(self, imagination, reward_head) or replay_reward(self, posterior, batch)."
+        )
     return made

@@ -27,6 +27,8 @@ class Planner(ABC):
 
     #: kind of ``config``; what ``planner_kwargs`` may name
     config_class: ClassVar[type[PlannerConfig]] = PlannerConfig
+    #: whether a policy plans with it
+    in_use = False
     #: whether actions may be numbers in [-1, 1], and choices among classes (one-hot)
     plans_numbers: ClassVar[bool] = True
     plans_choices: ClassVar[bool] = False
@@ -41,6 +43,18 @@ class Planner(ABC):
         self.config = config
         self.gae_lambda = gae_lambda
         self.classes: tuple[int, ...] = tuple(classes)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """As ever, until a policy plans with it: from then on the model says what it is, and saves that.
+
+        :raises AttributeError: for its settings then
+        """
+        if self.in_use and name in ("config", "gae_lambda", "classes"):
+            raise AttributeError(
+                f"The {name} of a policy's planner is not changed by hand, for the model would save and fine-tune with the "
+                f"old one, got {value!r}: give planner_kwargs to the model, or to its load()."
+            )
+        super().__setattr__(name, value)
 
     @abstractmethod
     def plan(

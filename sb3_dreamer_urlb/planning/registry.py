@@ -26,7 +26,8 @@ def register_planner(
     :param planner: subclass of :class:`Planner`
     :param for_choices: the one for Discrete and MultiDiscrete actions; None where ``planner`` takes them, too, or nobody does
     :param settled: fields of the configuration that the name decides, whatever preset or user say about them
-    :raises ValueError: if the name means something else already, or for anything that is no such subclass
+    :raises ValueError: if the name means something else already, for anything that is no such subclass, or for fields that
+        its configuration does not have
     """
     kinds = (planner,) if for_choices is None else (planner, for_choices)
     for kind in kinds:
@@ -34,6 +35,9 @@ def register_planner(
             raise ValueError(f"The planner {name!r} must be a subclass of Planner, got {kind!r}.")
     if not isinstance(name, str) or not name:
         raise ValueError(f"The name of a planner must be a text, got {name!r}.")
+    for kind in kinds:
+        fields = (field.name for field in dataclasses.fields(kind.config_class))
+        check_keys("settled", settled or {}, fields, kind.config_class.__qualname__)
     if name in _KINDS and (_KINDS[name], PLANNERS[name]) != (kinds, settled or {}):
         raise ValueError(f"The planner {name!r} is already {_KINDS[name][0].__qualname__}.")
     _KINDS[name], PLANNERS[name] = kinds, dict(settled or {})

@@ -6,7 +6,7 @@ Not in the file: the replay (``save_replay_buffer``, or a run folder), the envir
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import torch as th
@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.devices import chosen_device
-from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors
+from sb3_dreamer_urlb.snapshots import bounded_json, normalization, tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Archive, CallersError, Target, reading, writing
 from sb3_dreamer_urlb.snapshots.model_data import FIELDS, blank, check_whose, describe, needed, restore_fields
 from sb3_dreamer_urlb.snapshots.random_state import RandomStates
@@ -33,18 +33,22 @@ COMPILED = "_orig_mod."
 # -- saving ----------------------------------------------------------------------------------------------------------------
 
 
-def save(model: SavedAlgorithm, target: Target, run: dict[str, Any] | None = None) -> None:
+def save(
+    model: SavedAlgorithm, target: Target, run: dict[str, Any] | None = None, instead: Mapping[str, Any] | None = None
+) -> None:
     """Write a model; a path atomically.
 
     :param model: what to save
     :param target: path (``.zip`` is added where it has no suffix), or binary file object
     :param run: what a run folder adds, JSON
+    :param instead: constructor arguments that the file holds in place of the model's
     :raises ValueError: if a weight is not finite, or the file could not be read again; the old file stays
     :raises OSError: naming the path; the old file stays
     """
     model.take_over_changes()
     statistics = normalization.pack(model.get_vec_normalize_env()) if model.env is not None else model.loaded_statistics
     mine, data = _all_tensors(model), describe(model, run)
+    data["arguments"].update(values.encode(dict(instead or {})))
     content = tensors.pack({**mine, **statistics})
     _check_readable(model, data, tensors.table_of(mine))
     if run is None and (missing := needed(data)):

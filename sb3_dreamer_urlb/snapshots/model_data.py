@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import phases
+from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
 from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.signatures import constructed, named_parameters
@@ -96,6 +97,17 @@ def describe_arguments(model: SavedAlgorithm) -> dict[str, Any]:
     return {name: values.encode_or_describe(value) for name, value in arguments.items()}
 
 
+def _folder_of_logs(path: str | None) -> str | None:
+    """Where the file's model logs; None, with a warning, where that can be no folder on this machine."""
+    try:
+        if path is not None:
+            check_folder("tensorboard_log", path)
+    except NotADirectoryError as error:
+        warnings.warn(f"The model will log nowhere, unless you give another folder, load(..., tensorboard_log=...): {error}")
+        return None
+    return path
+
+
 def blank(
     algorithm: type[Model], data: dict[str, Any], device: th.device | str, custom: dict[str, Any], kwargs: dict[str, Any]
 ) -> Model:
@@ -116,6 +128,7 @@ def blank(
     if isinstance(given.get("planner"), Planner):
         given.setdefault("planner_kwargs", None)  # those stored belong to the one that it replaces
     check_registered(arguments, given)
+    values.check_objects(arguments, given)
     # A stored value that is replaced need not be one that can be read here.
     decoded = {
         name: values.decode(value) for name, value in arguments.items() if name not in given or name.endswith("_kwargs")
@@ -125,11 +138,13 @@ def blank(
     for name, value in decoded.items():
         if (missing := values.contains_custom(value)) is not None:
             raise ValueError(
-                f"its {name} was {missing.description}, which no file can hold; "
+                f"its {name} was {missing}, which no file can hold; "
                 f"give it again: load(..., custom_objects={{{name!r}: ...}}){or_another(name)}"
             )
         if name in CHECKS and name not in given and not CHECKS[name](value):
             raise ValueError(f"its {name} is {str(value)[:80]!r}")
+    if "tensorboard_log" not in given:
+        decoded["tensorboard_log"] = _folder_of_logs(decoded.get("tensorboard_log"))
     if isinstance(decoded.get("train_freq"), list):
         decoded["train_freq"] = tuple(decoded["train_freq"])
     policy = custom.get("policy", custom.get("policy_class", data["policy"]))

@@ -65,11 +65,12 @@ def load(
             raise ValueError("it has other fields than it should")
         parameters = {name: values.decode(value) for name, value in archive.data["parameters"].items()}
         _check_kind(kind, parameters, others)
+        values.check_objects(archive.data["parameters"], custom_objects or {})
         parameters.update(custom_objects or {})
         for name, value in parameters.items():
             if (missing := values.contains_custom(value)) is not None:
                 raise ValueError(
-                    f"its {name} was {missing.description}, which no file can hold; "
+                    f"its {name} was {missing}, which no file can hold; "
                     f"give it again: load(..., custom_objects={{{name!r}: ...}})"
                 )
         found = tensors.read_table(archive, TENSORS)

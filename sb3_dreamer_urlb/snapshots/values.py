@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,9 +36,14 @@ class Custom:
     """Stands for a value that was not stored and must be given when loading.
 
     :param description: of what it was
+    :param instance: whether it was an object of that class, with settings that the class alone does not tell
     """
 
     description: str
+    instance: bool = False
+
+    def __str__(self) -> str:
+        return f"an object of the class {self.description}" if self.instance else self.description
 
 
 def encode_or_describe(value: Any) -> Any:
@@ -49,8 +54,10 @@ def encode_or_describe(value: Any) -> Any:
         if isinstance(value, dict) and all(isinstance(key, str) and key != TAG for key in value):
             # Only what cannot be stored must be given again.
             return {key: encode_or_describe(item) for key, item in value.items()}
-        described = value if isinstance(value, type) or hasattr(value, "__qualname__") else type(value)
-        return {TAG: CUSTOM, "description": f"{described.__module__}.{described.__qualname__}"}
+        instance = not (isinstance(value, type) or hasattr(value, "__qualname__"))
+        described = type(value) if instance else value
+        note = {TAG: CUSTOM, "description": f"{described.__module__}.{described.__qualname__}"}
+        return {**note, "instance": True} if instance else note
 
 
 def encode(value: Any) -> Any:
@@ -112,6 +119,25 @@ def contains_custom(value: Any) -> Custom | None:
         return value
     children = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return next((found for found in map(contains_custom, children) if found is not None), None)
+
+
+def check_objects(stored: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Whether objects that no file can hold are given as objects: their classes would build others, with other settings.
+
+    :param stored: arguments of the file, as JSON
+    :param given: those of the caller, which replace them
+    :raises ValueError: for the class of what was an object
+    """
+    for name in stored.keys() & given.keys():
+        note, kind = stored[name], given[name]
+        # What is replaced need not be something that can be read here.
+        if not (isinstance(note, dict) and note.get(TAG) == CUSTOM and note.get("instance") and isinstance(kind, type)):
+            continue
+        if (its := f"{kind.__module__}.{kind.__qualname__}") == note.get("description"):
+            raise ValueError(
+                f"its {name} was an object of the class {its}, with settings that no file can hold: give such an object, "
+                "not the class"
+            )
 
 
 # -- intrinsic rewards -----------------------------------------------------------------------------------------------------
@@ -245,7 +271,7 @@ ENCODERS: dict[type, Callable[[Any], tuple[str, dict[str, Any]]]] = {
     CategoricalDynaMPC: _categorical_planner_fields,
 }
 DECODERS: dict[str, Callable[..., Any]] = {
-    CUSTOM: lambda description: Custom(str(description)),
+    CUSTOM: lambda description, instance=False: Custom(str(description), instance is True),
     "float": lambda value: {"inf": math.inf, "-inf": -math.inf}[value],
     "array": _array,
     "intrinsic": _intrinsic,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import runpy
+import shlex
 import sys
 from collections.abc import Sequence
 from unittest import mock
@@ -73,6 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         told_in_a_line(sys.argv[0]),
         mock.patch.object(argparse.ArgumentParser, "parse_args", parse_args),
         mock.patch.object(argparse.ArgumentParser, "error", error_in_a_line),
+        # The run keeps it, and its model card shows it: to be pasted into a shell.
+        mock.patch.object(sys, "orig_argv", [*map(shlex.quote, sys.orig_argv)]),
         mock.patch("rl_zoo3.utils.get_model_path", that_says_what_there_is(rl_zoo3.utils.get_model_path, sys.argv[0])),
         mock.patch("rl_zoo3.create_test_env", played.counting(rl_zoo3.create_test_env)),
     ):

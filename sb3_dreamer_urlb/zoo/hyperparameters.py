@@ -136,6 +136,8 @@ def _check_classes(key: str, entries: Any, filled_in: Iterable[str]) -> None:
             [(name, kwargs)] = entry.items()
         if isinstance(name, str):
             name = _find_class(key, name)
+        elif not callable(name):
+            raise ValueError(f"{key}: expected module.Class, got {name!r}.")
         if not isinstance(kwargs, dict):
             raise ValueError(f"{key}: expected arguments of {getattr(name, '__name__', name)} by name, got {kwargs!r}.")
         if isinstance(name, type):

@@ -492,6 +492,19 @@ def test_further_files(model, tmp_path):
         package_to_hub(model, folder, n_eval_episodes=1, video_length=0, extra_files={"../a": tmp_path / "a"})
 
 
+@pytest.mark.parametrize("name", ["README.md", "./config.json", "dreamerv2-test-Counter-v0.zip", "replay.mp4"])
+def test_further_files_take_no_other_s_place(model, tmp_path, name):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(ValueError, match=r"extra_files must leave .* to package_to_hub, got "):
+        package_to_hub(model, tmp_path / "shared", n_eval_episodes=1, video_length=0, extra_files={name: tmp_path / "a"})
+    assert not (tmp_path / "shared").exists()
+
+
+def test_counts_of_numpy(model, tmp_path):
+    package_to_hub(model, tmp_path, n_eval_episodes=np.int64(2), video_length=np.int32(0))
+    assert json.loads((tmp_path / "results.json").read_text())["n_eval_episodes"] == 2
+
+
 def test_the_card_says_what_an_environment_needs_that_no_package_registers(tiny_model, tmp_path, capsys):
     model = tiny_model(CounterEnv(8)).learn(8)
     package_to_hub(model, tmp_path, CounterEnv(8), 2, env_id="my env", video_length=0, progress_bar=True)
@@ -609,3 +622,18 @@ def test_a_card_tells_nothing_of_the_machine(tiny_model, tmp_path):
         text = (tmp_path / "hub" / name).read_text()
         assert str(tmp_path) not in text and f"python {MODULE}" in text
     assert '"path": "replay"' in (tmp_path / "hub" / "README.md").read_text()
+
+
+@pytest.mark.parametrize("store", ["lmdb", "memory"])
+def test_a_model_takes_none_of_its_makers_folders_along(tiny_model, weights, tmp_path, store):
+    replay = {"store": store, "max_episode_rows": 20, **({"path": str(tmp_path / "replay")} if store == "lmdb" else {})}
+    model = tiny_model(gymnasium.make(ID), replay_buffer_kwargs=replay, tensorboard_log=str(tmp_path / "logs")).learn(20)
+    package_to_hub(model, tmp_path / "hub", n_eval_episodes=1, video_length=0)
+    assert model.tensorboard_log == str(tmp_path / "logs") and model.replay_buffer_kwargs == replay
+    path = load_from_hub(tmp_path / "hub")
+    with zipfile.ZipFile(path) as archive:
+        assert not any(str(tmp_path).encode() in archive.read(name) for name in archive.namelist())
+    loaded = DreamerV2.load(path, env=gymnasium.make(ID))
+    assert loaded.tensorboard_log is None and loaded.replay_buffer_kwargs.get("max_episode_rows") == 20
+    assert weights(loaded.policy) == weights(model.policy) and loaded.replay_buffer.store == "memory"
+    loaded.learn(4)

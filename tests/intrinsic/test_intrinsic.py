@@ -25,6 +25,7 @@ from sb3_dreamer_urlb.intrinsic import (
     RewardSource,
     make_intrinsic_reward,
     registered_intrinsic_rewards,
+    registry,
 )
 from sb3_dreamer_urlb.intrinsic.moments import RunningMoments
 from sb3_dreamer_urlb.types import Imagination
@@ -399,6 +400,24 @@ def test_a_reward_of_another_shape_is_refused(tiny_model, part, expected, shape)
     model = tiny_model(intrinsic_reward=Misshapen(part, shape))
     with pytest.raises(ValueError, match=rf"Misshapen.{part} must return a float tensor of the shape {expected} = .*got"):
         model.learn(60)
+
+
+@pytest.mark.parametrize("kind", ["class", "instance", "name"])
+def test_who_makes_no_reward_would_seek_the_task_s(tiny_model, monkeypatch, kind):
+    class Misspelt(IntrinsicReward):
+        def rewards(self, imagination, reward_head):
+            return imagination.action.new_zeros(imagination.action.shape[:2])
+
+    class AtRandom(IntrinsicReward):
+        trains_actor = False
+
+    monkeypatch.setattr(registry, "_REGISTRY", {**registry._REGISTRY, "misspelt": Misspelt})
+    method = {"class": Misspelt, "instance": Misspelt(), "name": "misspelt"}[kind]
+    with pytest.raises(
+        ValueError, match=r"Misspelt makes no reward, and .* seek the task's: it must override reward\(self, im"
+    ):
+        tiny_model(intrinsic_reward=method)
+    tiny_model(intrinsic_reward=AtRandom)
 
 
 def test_skills_belong_to_a_skill_reward(tiny_model):

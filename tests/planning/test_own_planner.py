@@ -117,6 +117,17 @@ def test_what_no_file_can_hold_must_be_given_again(tiny_model, tmp_path, planner
         assert type(loaded) is (planner if isinstance(planner, type) else type(planner))
 
 
+def test_the_class_of_an_object_that_no_file_can_hold_is_no_such_object(tiny_model, tmp_path):
+    tiny_model(planner=Unregistered(PlannerConfig(**SMALL), 0.7)).save(tmp_path / "model")
+    with pytest.raises(SnapshotError, match=r"its planner was an object of the class .*Unregistered, which no file can hold"):
+        DreamerV2.load(tmp_path / "model")
+    for given in ({"custom_objects": {"planner": Unregistered}}, {"planner": Unregistered}):
+        with pytest.raises(SnapshotError, match=r"settings that no file can hold: give such an object, not the class"):
+            DreamerV2.load(tmp_path / "model", **given)
+    # Another class, or a name, is another planner, as asked for.
+    assert type(DreamerV2.load(tmp_path / "model", planner=Own).policy.planner) is Own
+
+
 @pytest.mark.parametrize("planner", ["own", Own, instance()])
 def test_a_file_whose_planner_is_not_registered_here_is_refused(tiny_model, tmp_path, planner, monkeypatch):
     tiny_model(planner=planner).save(tmp_path / "model")
@@ -140,6 +151,27 @@ def test_by_hand_is_refused_with_the_right_way(tiny_model):
     with pytest.raises(AttributeError, match=r"planner=\.\.\.\) or DreamerV2\.load\(path, planner="):
         policy.planner = instance()
     assert policy.planner is before
+
+
+@pytest.mark.parametrize("name", ["config", "gae_lambda", "classes"])
+def test_what_a_policy_plans_with_is_not_changed_by_hand(tiny_model, name):
+    its = instance()
+    model = tiny_model(planner=its)
+    planner = model.policy.planner
+    before, value = getattr(planner, name), getattr(planner, name)
+    with pytest.raises(AttributeError, match=rf"The {name} of a policy's planner is not changed by hand.*planner_kwargs"):
+        setattr(planner, name, value)
+    assert getattr(planner, name) is before
+    its.gae_lambda = 0.1  # the caller's own is another one
+    model.planner = "dyna_mpc"
+    model.planner_kwargs = {"n_samples": 9, "top_k": 2}
+    assert model.learn(1).policy.planner.config.n_samples == 9
+
+
+def test_a_name_settles_what_there_is():
+    with pytest.raises(ValueError, match=r"Unknown settled \['gian'\] for OwnConfig; known are .*Did you mean 'gain'"):
+        register_planner("settled", Own, settled={"gian": 1.0})
+    assert "settled" not in registered_planners()
 
 
 @pytest.mark.parametrize("planner", [3, object, "own ", Planner, ["own"]])

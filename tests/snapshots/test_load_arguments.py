@@ -109,3 +109,18 @@ def test_a_run_folder_extends(tmp_path):
     new_model(intrinsic_reward=None, intrinsic_kwargs=None).learn(20, callback=RunCheckpointCallback(tmp_path / "run", 20))
     model = DreamerV2.resume(tmp_path / "run", envs(1), device="cpu", planner_kwargs={"iterations": 5})
     assert model.planner_kwargs == {**STORED["planner_kwargs"], "iterations": 5}
+
+
+def test_a_folder_of_logs_that_can_be_none_here_is_left_out(tmp_path):
+    """Files come from other machines."""
+    logs = tmp_path / "logs"
+    file = file_of(new_model(intrinsic_reward="apt", tensorboard_log=str(logs)).save)
+    assert DreamerV2.load(file).tensorboard_log == str(logs)
+    logs.write_text("mine")
+    file.seek(0)
+    with pytest.warns(UserWarning, match=r"will log nowhere, unless you give another folder, .*tensorboard_log must be"):
+        assert DreamerV2.load(file, env=envs(1)).learn(2).tensorboard_log is None
+    file.seek(0)
+    with pytest.raises(NotADirectoryError, match="tensorboard_log must be the path of a folder"):
+        DreamerV2.load(file, tensorboard_log=str(logs))
+    assert logs.read_text() == "mine"

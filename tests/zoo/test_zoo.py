@@ -6,6 +6,7 @@ import copy
 import itertools
 import os
 import re
+import shlex
 import subprocess
 import sys
 import warnings
@@ -281,6 +282,28 @@ def test_mistakes_are_named(zoo, monkeypatch, capsys):
         main(["dance"])
 
 
+@pytest.mark.parametrize("steps", ["0", "-5"])
+def test_a_run_of_no_steps_is_refused(zoo, capsys, steps):
+    line = refused(capsys, zoo, *TRAIN, "--env", STAND, "-conf", "lbs", f"-n={steps}", "-params", *TINY)
+    assert f"-n must be a positive number of agent steps, got {steps}" in line
+
+
+def test_the_command_of_a_run_can_be_pasted_into_a_shell(zoo, monkeypatch):
+    given = [
+        sys.executable,
+        "-m",
+        "sb3_dreamer_urlb.zoo",
+        "train",
+        "-params",
+        "preset:'tiny'",
+        "checkpoint:dict(every_frames=9)",
+    ]
+    monkeypatch.setattr(sys, "orig_argv", given)
+    run = train(zoo, STAND, 8, "lbs", params=TINY)
+    assert shlex.split((run / STAND.replace("/", "-") / "command.txt").read_text()) == given
+    assert sys.orig_argv == given
+
+
 @pytest.mark.parametrize(
     ("option", "said"), [("--seed=x", "argument --seed: invalid int value: 'x'"), ("--sede=1", "arguments: --sede=1")]
 )
@@ -326,6 +349,8 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
             f"callback:'{SWITCH[:-2]}'",
             "callback: sb3_dreamer_urlb has no 'PhaseSwitchCallba'. Did you mean 'PhaseSwitchCallback'",
         ),
+        ("callback:3", "callback: expected module.Class, got 3."),
+        ("env_wrapper:[4.5]", "env_wrapper: expected module.Class, got 4.5."),
         ("callback:'PhaseSwitchCallback'", f"expected module.Class, got 'PhaseSwitchCallback'. Did you mean '{SWITCH}'"),
         ("callback:'sb3_dreamer.PhaseSwitchCallback'", f"No module named 'sb3_dreamer'. Did you mean '{SWITCH}'"),
         ("callback:'nowhere.Callback'", "callback: nowhere.Callback cannot be imported: No module named 'nowhere'"),
