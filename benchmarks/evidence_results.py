@@ -122,14 +122,24 @@ def needed(found: Scores) -> str:
     return "\n".join(lines)
 
 
-def draw(path: Path) -> None:
-    """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task."""
+def draw(path: Path, size: str = "state") -> None:
+    """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task.
+
+    :param path: of the PNG
+    :param size: the setting whose tasks are drawn
+    :raises ValueError: if it has no two runs of an agent yet
+    """
     import matplotlib.pyplot as plt
 
     # An interval takes two runs at least.
-    tasks = {task: arms for task, arms in training_returns().items() if max(map(len, arms.values())) > 1}
-    figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 2.6)
-    for axes, (task, arms) in zip(panels, tasks.items(), strict=True):
+    enough = {task: arms for task, arms in training_returns().items() if max(map(len, arms.values())) > 1}
+    wanted = dict.fromkeys(task for _, tasks, _ in study.STUDY[size] for task in tasks)
+    tasks = [task for task in wanted if study.prefix(size) + task in enough]
+    if not tasks:
+        raise ValueError(f"An interval takes two runs of an agent at least, and the setting {size!r} has none yet.")
+    figure, panels = new_figure(len(tasks), 3.4 * len(tasks), 3.3)
+    for axes, task in zip(panels, tasks, strict=True):
+        arms = enough[study.prefix(size) + task]
         for i, (arm, label) in enumerate(LABELS.items()):
             runs = arms.get(arm, [])
             if len(runs) < 2 or study.ARMS[arm].changes:
@@ -142,10 +152,11 @@ def draw(path: Path) -> None:
             axes.fill_between(frames, low, high, color=COLORS[i], alpha=0.2, lw=0)
         axes.set(title=f"{study.BODIES.get(task, 'walker')} {task}", xlabel="environment frames of the task", ylim=(0, None))
         axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
-        axes.legend(loc="upper left", title="agent (seeds)", title_fontsize=7)
+        # Below: curves that rise leave no corner of their panel free.
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), title="agent (seeds)", title_fontsize=7)
     panels[0].set_ylabel("return of a training episode")
     figure.tight_layout()
-    figure.savefig(path, dpi=160)
+    figure.savefig(path, dpi=160, bbox_inches="tight", pad_inches=0.05)
     plt.close(figure)
 
 
@@ -154,11 +165,12 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figure", type=Path, help="PNG to draw the learning curves into")
+    parser.add_argument("--setting", choices=sorted(study.STUDY), default="state", help="whose curves (default: state)")
     options = parser.parse_args()
     found = scores()
     print(f"{table(found)}\n\nDifference from scratch, and seeds an arm that it needs:\n\n{needed(found)}")
     if options.figure is not None:
-        draw(options.figure)
+        draw(options.figure, options.setting)
 
 
 if __name__ == "__main__":

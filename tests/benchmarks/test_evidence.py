@@ -147,6 +147,26 @@ def test_curves_are_drawn(study, evidence, results, tmp_path):
     (study.ROOT / "rows.csv").write_text(COLUMNS + "\n")
     results.draw(tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 5000
+    with pytest.raises(ValueError, match="two runs of an agent at least, and the setting 'pixels' has none yet"):
+        results.draw(tmp_path / "pixels.png", "pixels")
+
+
+@pytest.mark.parametrize("size", ["state", "pixels"])
+def test_a_figure_shows_one_setting(study, evidence, results, tmp_path, monkeypatch, size):
+    monkeypatch.setattr(study, "STUDY", dict.fromkeys(("state", "pixels"), ((("scratch",), ("run", "flip"), 2),)))
+    runs = {"scratch": [[1, 2, 3], [2, 3, 4]]}
+    write(study, evidence, {"run": runs, "flip": runs, "pixels-flip": runs})
+    (study.ROOT / "rows.csv").write_text(COLUMNS + "\n")
+    panels = []
+
+    def figure_of(count, *inches):
+        figure, axes = new_figure(count, *inches)
+        panels.extend(axes)
+        return figure, axes
+
+    monkeypatch.setattr(results, "new_figure", figure_of)
+    results.draw(tmp_path / "curves.png", size)
+    assert [axes.get_title() for axes in panels] == ["walker run", "walker flip"][1 if size == "pixels" else 0 :]
 
 
 def test_no_panel_for_a_single_run(study, evidence, results, tmp_path, monkeypatch):
