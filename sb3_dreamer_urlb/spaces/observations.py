@@ -54,6 +54,18 @@ class Observations(ABC):
         """
 
 
+def _cure(space: spaces.Space[Any]) -> str:
+    """What may help where pictures are wanted: wrappers that change the number of sizes are used to other agents."""
+    if isinstance(space, spaces.Box) and len(space.shape) == 2:
+        return "A picture has channels, if only one: GrayscaleObservation(env, keep_dim=True)."
+    if isinstance(space, spaces.Box) and len(space.shape) == 4:
+        return "The model remembers what it saw: leave FrameStackObservation out, or stack channels with SB3's VecFrameStack."
+    return (
+        'Use "MlpPolicy" for vectors, and VecNormalize(norm_obs=False) for images; for dm_control tasks '
+        "gymnasium.make('urlb/<domain>-<task>-v0')."
+    )
+
+
 class Images(Observations):
     """Images, channels first, scaled from the space's bounds to [-0.5, 0.5].
 
@@ -68,8 +80,7 @@ class Images(Observations):
         if not isinstance(space, spaces.Box) or not is_image_space(space, normalized_image=not normalize_images):
             raise UnsupportedSpaceError(
                 "CnnPolicy needs image observations: Box(0, 255, (height, width, channels), uint8), or floats, channels "
-                f'first, with policy_kwargs={{"normalize_images": False}}, got {space}. Use "MlpPolicy" for vectors, and '
-                "VecNormalize(norm_obs=False) for images; for dm_control tasks gymnasium.make('urlb/<domain>-<task>-v0')."
+                f'first, with policy_kwargs={{"normalize_images": False}}, got {space}. {_cure(space)}'
             )
         low, high = float(space.low.min()), float(space.high.max())
         # ±float32.max is how an unbounded space is written by many.

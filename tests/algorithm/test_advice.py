@@ -76,6 +76,13 @@ def test_a_policy_for_other_observations_names_the_right_ones(algorithm):
         algorithm("MultiInputPolicy", seeing(VECTOR), preset="tiny")
 
 
+@each
+@pytest.mark.parametrize(("shape", "cure"), [((64, 64), "keep_dim=True"), ((4, 64, 64, 3), "leave FrameStackObservation out")])
+def test_what_wrappers_made_of_a_picture(algorithm, shape, cure):
+    with pytest.raises(ValueError, match=rf"CnnPolicy needs image observations.*{cure}"):
+        algorithm("CnnPolicy", seeing(spaces.Box(0, 255, shape, np.uint8)), preset="tiny")
+
+
 # -- presets ---------------------------------------------------------------------------------------------------------------
 
 
