@@ -725,7 +725,7 @@ def test_policy_files(saved, tmp_path):
 
 def test_a_policy_with_a_class_of_ones_own(tiny_model, tmp_path):
     tiny_model(intrinsic_reward=Other).policy.save(tmp_path / "policy")
-    with pytest.raises(SnapshotError, match=r"its intrinsic was test_snapshot\.Other"):
+    with pytest.raises(SnapshotError, match=r"its intrinsic was an object of the class test_snapshot\.Other"):
         DreamerPolicy.load(tmp_path / "policy")
     loaded = DreamerPolicy.load(tmp_path / "policy", custom_objects={"intrinsic": Other()})
     assert type(loaded.agent.intrinsic) is Other
