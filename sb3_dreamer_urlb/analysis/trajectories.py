@@ -14,6 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
+from sb3_dreamer_urlb.evaluation.protocol import stacked
 from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.types import SequenceBatch
@@ -103,7 +104,7 @@ def _first_episodes(model: DreamerV2, env: VecEnv, normalizer: VecNormalize | No
             actions[i].append(action[i])
             rewards[i].append(float(reward[i]))
         going &= ~start[:count]
-    return [Trajectory(_stacked(seen[i]), np.stack(actions[i]), np.array(rewards[i], np.float32)) for i in range(count)]
+    return [Trajectory(stacked(seen[i]), np.stack(actions[i]), np.array(rewards[i], np.float32)) for i in range(count)]
 
 
 def _rows(model: DreamerV2, observation: Any) -> list[Any]:
@@ -113,12 +114,6 @@ def _rows(model: DreamerV2, observation: Any) -> list[Any]:
         arrays = {name: part.cpu().numpy() for name, part in tensors.items()}
         return [{name: part[i] for name, part in arrays.items()} for i in range(len(next(iter(arrays.values()))))]
     return list(tensors.cpu().numpy())
-
-
-def _stacked(rows: Sequence[Any]) -> np.ndarray | dict[str, np.ndarray]:
-    if isinstance(rows[0], dict):
-        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return np.stack(rows)
 
 
 # -- files -----------------------------------------------------------------------------------------------------------------

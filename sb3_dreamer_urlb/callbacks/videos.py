@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.evaluation.films import labelled_agent, labelled_open_loop
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
-from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures, predict_open_loop
+from sb3_dreamer_urlb.evaluation.open_loop import has_image, pictures_in, predict_open_loop
 from sb3_dreamer_urlb.folders import check_folder, made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
@@ -129,8 +129,7 @@ class VideoCallback(WithKnownKeywords, BaseCallback):
             truth, predicted = predict_open_loop(
                 model.policy, played.observations, played.actions, self.open_loop_start, self.context, self.horizon
             )
-        images = [image_of(kind, part) for part in (truth, predicted)]
-        its_truth, its_model = (pictures(image) for image in images if image is not None)
+        its_truth, its_model = (pictures_in(kind, part) for part in (truth, predicted))
         panels = labelled_open_loop(its_truth, its_model, self.context, self.open_loop_start)
         self._put(OPEN_LOOP, list(panels), played.fps)
 

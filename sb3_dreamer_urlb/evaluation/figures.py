@@ -13,7 +13,7 @@ import torch as th
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
 from sb3_dreamer_urlb.evaluation.films import labelled_open_loop, truth_model_error
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
-from sb3_dreamer_urlb.evaluation.open_loop import dream, has_image, image_of, pictures, predict_open_loop
+from sb3_dreamer_urlb.evaluation.open_loop import dream, has_image, pictures_in, predict_open_loop
 from sb3_dreamer_urlb.evaluation.protocol import PlayedEpisode
 from sb3_dreamer_urlb.types import Observation
 from sb3_dreamer_urlb.version import how_to_install
@@ -94,7 +94,7 @@ def open_loop(policy: DreamerPolicy, episode: PlayedEpisode, start: int, steps: 
     :raises ValueError: if the agent sees no images, or the episode is too short
     """
     truth, predicted = predict_open_loop(policy, _seen(policy, episode), episode.actions, start, CONTEXT, steps)
-    return _pictures(policy, truth), _pictures(policy, predicted)
+    return pictures_in(policy.observations, truth), pictures_in(policy.observations, predicted)
 
 
 def _seen(policy: DreamerPolicy, episode: PlayedEpisode) -> Observation:
@@ -106,13 +106,6 @@ def _seen(policy: DreamerPolicy, episode: PlayedEpisode) -> Observation:
         raise ValueError(f"Pictures of predictions need an agent that sees images, this one sees {policy.observation_space}.")
     seen: Observation = policy.obs_to_tensor(episode.observations)[0]
     return seen
-
-
-def _pictures(policy: DreamerPolicy, observation: Observation) -> np.ndarray:
-    """The image in preprocessed observations, as :func:`pictures`."""
-    image = image_of(policy.observations, observation)
-    assert image is not None
-    return pictures(image)
 
 
 def open_loop_errors(
@@ -136,7 +129,8 @@ def open_loop_errors(
     truth, features = dream(policy, _seen(policy, episode), episode.actions, start, CONTEXT, steps)
     with th.no_grad():
         model = policy.agent.world_model
-        difference = (_pictures(policy, model.decoder(features)).astype(float) - _pictures(policy, truth)) ** 2
+        predicted, seen = (pictures_in(policy.observations, part) for part in (model.decoder(features), truth))
+        difference = (predicted.astype(float) - seen) ** 2
         rewards = model.reward(features).cpu().numpy().reshape(-1)
     errors = np.sqrt(difference.mean((1, 2, 3)))
     shown = np.arange(len(errors)) - CONTEXT + 1

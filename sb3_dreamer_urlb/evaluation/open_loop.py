@@ -77,6 +77,17 @@ def image_of(observations: Observations, observation: Observation) -> th.Tensor 
     return observation if isinstance(observations, Images) and isinstance(observation, th.Tensor) else None
 
 
+def pictures_in(observations: Observations, observation: Observation) -> np.ndarray:
+    """The image in preprocessed observations, of Dicts the first one, as :func:`pictures`.
+
+    :param observations: of what kind they are: one with an image in it
+    :param observation: float, see :func:`pictures`
+    """
+    image = image_of(observations, observation)
+    assert image is not None
+    return pictures(image)
+
+
 def pictures(image: Observation) -> np.ndarray:
     """Preprocessed images as pictures in colour; of stacked frames the last.
 

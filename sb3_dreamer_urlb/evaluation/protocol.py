@@ -79,11 +79,14 @@ def play_episode(
         actions.append(action)
         if render:
             frames.append(np.asarray(env.render()))
-    return PlayedEpisode(_stacked(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
+    return PlayedEpisode(stacked(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
 
 
-def _stacked(observations: Sequence[Any]) -> np.ndarray | dict[str, np.ndarray]:
-    """Observations in a row, those of Dicts by name."""
+def stacked(observations: Sequence[Any]) -> np.ndarray | dict[str, np.ndarray]:
+    """Observations in a row, (n, …), those of Dicts by name.
+
+    :param observations: as one environment gave them, n
+    """
     if isinstance(observations[0], dict):
         return {name: np.stack([one[name] for one in observations]) for name in observations[0]}
     return np.stack(observations)

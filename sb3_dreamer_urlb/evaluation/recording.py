@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
-from sb3_dreamer_urlb.evaluation.open_loop import has_image, image_of, pictures
+from sb3_dreamer_urlb.evaluation.open_loop import has_image, pictures_in
 from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 from sb3_dreamer_urlb.types import Observation
 
@@ -164,9 +164,7 @@ def _picture(model: AgentAlgorithm, env: VecEnv, observation: Any) -> np.ndarray
     if env.render_mode == "rgb_array":
         return _rendered(env)
     policy = model.policy
-    image = image_of(policy.observations, policy.observations.preprocess(_stacked([observation])))
-    assert image is not None
-    shown: np.ndarray = pictures(image)[0]
+    shown: np.ndarray = pictures_in(policy.observations, policy.observations.preprocess(_stacked([observation])))[0]
     return shown
 
 

@@ -46,19 +46,8 @@ class EpisodeBuffer(ReplayBuffer):
 
     Memory is taken as episodes arrive. When more than ``buffer_size`` rows are held, whole episodes go, oldest first.
 
-    :param buffer_size: rows (agent steps, plus one a episode) to hold
-    :param observation_space: of one environment, channels first
-    :param action_space: of one environment
-    :param device: where batches go
-    :param n_envs: number of streams
-    :param shortest: finished episodes of fewer rows are not kept
-    :param max_episode_rows: longer episodes are stored in pieces of this many rows
-    :param phase: name of the phase that filled it
-    :param skill_size: W, size of the skills to store with each row, 0 for none
-    :param tasks: names of tasks whose rewards are stored with each row, from ``info["domain_rewards"]``
-    :param store: where finished episodes are, see :class:`~sb3_dreamer_urlb.SequenceReplayBuffer`
-    :param path: folder of the file; each phase has its own in it
-    :param map_size: bytes that the file may have; None for what ``buffer_size`` rows need
+    Its arguments are those of :class:`~sb3_dreamer_urlb.SequenceReplayBuffer` that say what is kept, and where.
+
     :raises ValueError: for arguments that do not fit
     :raises ModuleNotFoundError: if lmdb is not installed
     """
@@ -71,7 +60,6 @@ class EpisodeBuffer(ReplayBuffer):
         device: th.device | str,
         n_envs: int,
         *,
-        shortest: int,
         max_episode_rows: int,
         phase: str,
         skill_size: int,
@@ -84,7 +72,6 @@ class EpisodeBuffer(ReplayBuffer):
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         check_integer("max_episode_rows", max_episode_rows, 1)
         self.buffer_size = buffer_size
-        self.shortest = shortest
         # A piece must fit into the buffer, or it would be all that is ever held.
         self.max_episode_rows = min(max_episode_rows, buffer_size)
         self.phase = phase
@@ -111,6 +98,10 @@ class EpisodeBuffer(ReplayBuffer):
         if self.path is not None:
             self.attach(taking_over=True)
             self.roll_back(0, {"evicted": 0, "finished_count": 0, "longest": 0})
+
+    def _shortest(self) -> int:
+        """Rows that a finished episode must have to be kept."""
+        return 1
 
     def _before_change(self) -> None:
         """What is held is about to be other episodes, or in another place: for whoever reads in a thread."""
@@ -248,7 +239,7 @@ class EpisodeBuffer(ReplayBuffer):
             return
         self.finished_count += 1
         self.longest = max(self.longest, len(episode))
-        if len(episode) < self.shortest:
+        if len(episode) < self._shortest():
             return
         self._before_change()
         if self.disk is None:

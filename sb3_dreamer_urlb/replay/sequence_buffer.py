@@ -78,10 +78,20 @@ class SequenceReplayBuffer(EpisodeBuffer):
         if seed is not None:
             check_integer("seed", seed, 0)
         check_sampling(sampling)
-        shortest = batch_length if sampling == BY_EPISODE else 1
-        kept: dict[str, Any] = {"shortest": shortest, "max_episode_rows": max_episode_rows, "phase": phase}
-        kept |= {"skill_size": skill_size, "tasks": tasks, "store": store, "path": path, "map_size": map_size}
-        super().__init__(buffer_size, observation_space, action_space, device, n_envs, **kept)
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs,
+            max_episode_rows=max_episode_rows,
+            phase=phase,
+            skill_size=skill_size,
+            tasks=tasks,
+            store=store,
+            path=path,
+            map_size=map_size,
+        )
         if batch_length > self.max_episode_rows:
             raise ValueError(
                 f"batch_length={batch_length} must not exceed buffer_size={buffer_size} "
@@ -107,6 +117,9 @@ class SequenceReplayBuffer(EpisodeBuffer):
         """
         if batch_length != self.batch_length:
             raise ValueError(f"the replay buffer has batch_length={batch_length}, the model {self.batch_length}")
+
+    def _shortest(self) -> int:
+        return self.batch_length if self.sampling == BY_EPISODE else 1
 
     def _before_change(self) -> None:
         self._prefetcher.discard()

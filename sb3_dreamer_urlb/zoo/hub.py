@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.hub.privacy import as_plain, plain_for_everybody
 from sb3_dreamer_urlb.snapshots.vec_normalize import load_vec_normalize
@@ -131,8 +132,7 @@ def load(argv: Sequence[str], prog: str) -> str:
         raise ValueError(f"{repo_id}: normalize is {config.get('normalize')!r}, but there is a {STATISTICS}, or none.")
     if target.is_dir() and number > 0:
         shutil.rmtree(target)
-    settings = target / env_name
-    settings.mkdir(parents=True, exist_ok=True)
+    settings = made_folder("a folder of --folder", target / env_name)
     shutil.copyfile(model, target / f"{env_name}.zip")
     (settings / CONFIG).write_text(yaml.safe_dump(config))
     (settings / ARGUMENTS).write_text(yaml.safe_dump({"env": options.env, "env_kwargs": env_kwargs}))

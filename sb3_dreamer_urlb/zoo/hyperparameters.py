@@ -48,7 +48,7 @@ def check(hyperparams: dict[str, Any], algorithm: str, arguments: Iterable[str])
     for path, text in _texts({name: value for name, value in hyperparams.items() if name != OF_THE_ENVIRONMENT}):
         if EXPONENT.fullmatch(text):
             raise ValueError(f"{path}: YAML reads {text} as text, not as a number: write {_for_yaml(text)}.")
-    _check_steps(hyperparams.get("n_timesteps", 1))
+    check_steps("n_timesteps", hyperparams.get("n_timesteps", 1))
     for name in WHOLE_NUMBERS & set(hyperparams):
         check_integer(name, hyperparams[name], 1)
     for key, filled_in in CLASSES.items():
@@ -95,13 +95,18 @@ def _check_normalize(normalize: Any) -> None:
         )
 
 
-def _check_steps(steps: Any) -> None:
+def check_steps(name: str, steps: Any) -> None:
+    """
+    :param name: of what says how long a run is
+    :param steps: what it says
+    :raises ValueError: if that is no number of steps
+    """
     try:
         positive = int(steps) >= 1
     except (TypeError, ValueError, OverflowError):
         positive = False
     if not positive:
-        raise ValueError(f"n_timesteps must be a positive number of agent steps, got {steps!r}.")
+        raise ValueError(f"{name} must be a positive number of agent steps, got {steps!r}.")
 
 
 def _texts(value: Any, path: str = "") -> Iterator[tuple[str, str]]:

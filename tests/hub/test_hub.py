@@ -26,7 +26,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_dreamer_urlb
-from sb3_dreamer_urlb import DreamerV2, DrQv2, SnapshotError, register_intrinsic_reward, register_planner
+from sb3_dreamer_urlb import DreamerV2, DrQv2, PlannerConfig, SnapshotError, register_intrinsic_reward, register_planner
 from sb3_dreamer_urlb.hub import load_from_hub, load_vec_normalize, package_to_hub, push_to_hub, save_vec_normalize
 from sb3_dreamer_urlb.hub import package as packaging
 from sb3_dreamer_urlb.hub.privacy import without_private_paths
@@ -575,6 +575,13 @@ def test_the_card_says_what_of_its_makers_own_is_needed(registries, tiny_model, 
         named = f"{kind.__module__}.{kind.__qualname__}"
         assert f"# Its {argument} is {named}, which this package does not have:\n# {hows[argument]}\n" in text
         assert parts[argument]["kind"] == named
+
+
+@pytest.mark.filterwarnings("ignore:No file can hold")
+def test_the_card_asks_for_an_object_where_the_class_would_not_do(tiny_model, tmp_path):
+    planner = OwnPlanner(PlannerConfig(n_samples=8, top_k=4, horizon=3), 0.9)
+    package_to_hub(tiny_model(gymnasium.make(ID), planner=planner), tmp_path, n_eval_episodes=1, video_length=0)
+    assert '# load(..., custom_objects={"planner": OwnPlanner(...)}), or load(' in card(tmp_path).text
 
 
 def test_what_the_package_has_needs_nothing(model, tmp_path):

@@ -645,6 +645,9 @@ def test_a_normalised_run_is_shared_without_pickles(zoo, monkeypatch, capsys):
     zoo("push_to_hub", *SHARE, "-f", "logs", "--no-render", "--n-eval-episodes", "1")
     repository = Path("hub/dreamerv2-urlb-walker-stand-v0")
     assert not list(repository.rglob("*.pkl")) and "load_vec_normalize" in (repository / "README.md").read_text()
+    Path("file").write_text("mine")
+    assert main(["load_from_hub", *SHARE, "-f", "file"]) == 2
+    assert "a folder of --folder must be the path of a folder, got 'file/dreamerv2/" in capsys.readouterr().err
     zoo("load_from_hub", *SHARE, "-f", "elsewhere")
     here, there = (
         VecNormalize.load(
