@@ -24,6 +24,7 @@ def tell(program: str, error: Exception) -> None:
     """Print a mistake to standard error.
 
     :param program: name of the command, which begins the line
-    :param error: whose text is put into one line
+    :param error: whose text and notes are put into one line
     """
-    print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
+    text = " ".join([str(error), *getattr(error, "__notes__", ())])
+    print(f"{program}: {' '.join(text.split())}", file=sys.stderr)

@@ -22,6 +22,7 @@ from sb3_dreamer_urlb.algorithm.environment_checks import needed_env
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.algorithm.training_loop import LearningVecEnv
 from sb3_dreamer_urlb.envs import env_steps
+from sb3_dreamer_urlb.envs.broken_rules import asking_to
 from sb3_dreamer_urlb.envs.faults import check_finite_action
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.envs.normalized import RewardsOnly, hides_originals, original_end, original_observations
@@ -231,7 +232,8 @@ class CollectingAlgorithm(SavingAlgorithm):
         """
         env = needed_env(self, "restart_episodes")
         self.replay_buffer.close_streams()
-        self._last_obs = env.reset()  # type: ignore[assignment]
+        with asking_to("reset"):
+            self._last_obs = env.reset()  # type: ignore[assignment]
         self._last_episode_starts = np.ones(env.num_envs, bool)
         self._begin_episodes()
 

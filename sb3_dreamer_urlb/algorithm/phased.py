@@ -18,6 +18,7 @@ from sb3_dreamer_urlb.algorithm.environment_checks import needed_env
 from sb3_dreamer_urlb.algorithm.environments import EnvironmentAlgorithm
 from sb3_dreamer_urlb.algorithm.updates_due import UpdatesDue
 from sb3_dreamer_urlb.devices import chosen_device
+from sb3_dreamer_urlb.envs import broken_rules
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
@@ -296,7 +297,13 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             # The environments are about to be reset.
             self.replay_buffer.close_streams()
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+            self._last_obs = None
+        try:
+            result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        except broken_rules.RAISED as error:
+            if self._last_obs is None:
+                broken_rules.annotate(error, "reset")
+            raise
         if self.run_folder is not None:
             self.run_folder.restore_normalization(self.get_vec_normalize_env(), self.restart_episodes)
         self._logged_phase = None

@@ -19,6 +19,8 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_dreamer_urlb.envs.broken_rules import asking_to
+
 
 class LearningVecEnv(VecEnvWrapper):
     """Environments in whose last step of a rollout the learner works.
@@ -44,7 +46,8 @@ class LearningVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         """As the environments'."""
-        return self.venv.reset()
+        with asking_to("reset"):
+            return self.venv.reset()
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions."""
@@ -64,7 +67,8 @@ class LearningVecEnv(VecEnvWrapper):
                 with suppress(Exception):
                     self.venv.step_wait()
                 raise
-        return self.venv.step_wait()
+        with asking_to("step"):
+            return self.venv.step_wait()
 
 
 def learn(

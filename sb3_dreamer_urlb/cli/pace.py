@@ -13,6 +13,7 @@ import torch as th
 
 from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 from sb3_dreamer_urlb.types import SequenceBatch
+from sb3_dreamer_urlb.words import counted
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,36 @@ class Amount:
         """How long it takes."""
         acting = self.plans * pace.plan + (self.steps - self.plans) * pace.act
         return self.steps * pace.step + acting + self.updates * pace.update
+
+
+@dataclass
+class Left:
+    """What is left of a run that learns and then plays: as was expected, times how much slower it has been so far.
+
+    :param learning: seconds expected until so many frames are learnt
+    :param after: seconds expected of what comes after all of them
+    :param total: frames
+    """
+
+    learning: Callable[[int], float]
+    after: float
+    total: int
+    #: frames and time of the first look: what comes before it, processes that start, is no pace
+    first: tuple[int, float] | None = None
+
+    def seconds(self, frames: int, now: float) -> float | None:
+        """
+        :param frames: learnt by now
+        :param now: in seconds, of any clock
+        :return: how long it will still take; None at the first look
+        """
+        if self.first is None:
+            self.first = frames, now
+        done, began = self.first
+        expected = self.learning(frames) - self.learning(done)
+        if expected <= 0:
+            return None
+        return (now - began) / expected * (self.learning(self.total) - self.learning(frames) + self.after)
 
 
 def phase(model: DreamerV2, frames: int, plans: bool) -> Amount:
@@ -116,7 +147,7 @@ def shrink(seconds: Callable[[float], float], limit: float, least: float) -> flo
 def in_words(seconds: float) -> str:
     """A duration, for people."""
     if seconds < 90:
-        return f"about {max(1, round(seconds))} seconds"
+        return f"about {counted(max(1, round(seconds)), 'second')}"
     if seconds < 5400:
         return f"about {round(seconds / 60)} minutes"
     return f"about {seconds / 3600:.1f} hours"

@@ -86,7 +86,7 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     check_plots_installed()
     began = time.time()
     made_folder("--out", config.out)
-    config = fitted(config)
+    config, left = fitted(config)
     agents = _agents(config)
     for agent in agents.values():
         _forget(agent.folder)
@@ -94,8 +94,8 @@ def run_demo(config: DemoConfig) -> dict[str, float]:
     with ProcessPoolExecutor(_at_once(), mp_context=multiprocessing.get_context("forkserver")) as pool:
         if config.pretrain_frames:
             _pretrain(config, pool)
-        print(f"\nReturns of the training episodes\n{'frames':>8}{SCRATCH:>15}{PRETRAINED:>15}", flush=True)
-        _watch([pool.submit(demo_agents.learn_task, agent) for agent in agents.values()], agents)
+        print(f"\nReturns of the training episodes\n{'frames':>8}{SCRATCH:>15}{PRETRAINED:>15}{'left':>20}", flush=True)
+        _watch([pool.submit(demo_agents.learn_task, agent) for agent in agents.values()], agents, left)
     random = _random(config)
     _draw(config, agents, random)
     _print_table(config, agents, random, time.time() - began)
@@ -130,12 +130,12 @@ def _at_once() -> int:
 # -- how long --------------------------------------------------------------------------------------------------------------
 
 
-def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
+def fitted(config: DemoConfig, limit: float = LIMIT) -> tuple[DemoConfig, pace.Left]:
     """Say how long it will take on this machine; on a slow one take fewer frames, and say that, too.
 
     :param config: numbers that are not the defaults are somebody's wish, and stay
     :param limit: seconds
-    :return: what to do
+    :return: what to do, and what tells while it is done how long it will still take
     """
     env = demo_agents.make_env(env_id(DOMAIN, config.task))
     model = DreamerV2("MlpPolicy", env, preset=config.preset, planner="dyna_mpc", seed=config.seed, device="cpu")
@@ -150,15 +150,18 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
             else config
         )
 
+    episode = EPISODE // model.action_repeat
+    steps = config.episodes * episode
+    # Evaluations play all their episodes at once.
+    played = pace.Amount(2 * steps + demo_agents.FILM_STEPS, 0, 0).seconds(its_pace) + episode * its_pace.plan
+    random = steps * its_pace.step
+
+    def learning(frames: int) -> float:
+        return pace.phase(model, frames, False).seconds(its_pace)
+
     def seconds(share: float) -> float:
-        episode = EPISODE // model.action_repeat
-        steps = config.episodes * episode
-        # Evaluations play all their episodes at once.
-        played = pace.Amount(2 * steps + demo_agents.FILM_STEPS, 0, 0).seconds(its_pace) + episode * its_pace.plan
-        learning = pace.phase(model, at(share).finetune_frames, False).seconds(its_pace)
-        before = pace.phase(model, config.pretrain_frames, False).seconds(its_pace)
-        random = steps * its_pace.step
-        return before + (learning + played) * (BESIDE if _at_once() > 1 else 2) + random
+        both = (learning(at(share).finetune_frames) + played) * (BESIDE if _at_once() > 1 else 2)
+        return learning(config.pretrain_frames) + both + random
 
     share = pace.shrink(seconds, limit, LEAST)
     chosen = at(share)
@@ -177,7 +180,7 @@ def fitted(config: DemoConfig, limit: float = LIMIT) -> DemoConfig:
             f"So few frames hold no update: agents learn from frame {model.learning_starts * model.action_repeat} on.",
             flush=True,
         )
-    return chosen
+    return chosen, pace.Left(learning, played + random, chosen.finetune_frames)
 
 
 # -- while it works --------------------------------------------------------------------------------------------------------
@@ -198,8 +201,8 @@ def _pretrain(config: DemoConfig, pool: ProcessPoolExecutor) -> None:
     work.result()
 
 
-def _watch(work: Sequence[Future[Path]], agents: Mapping[str, Agent]) -> None:
-    """Print what the agents get while they learn, a line when both have come so far.
+def _watch(work: Sequence[Future[Path]], agents: Mapping[str, Agent], left: pace.Left) -> None:
+    """Print what the agents get while they learn, a line when both have come so far, and how long it will still take.
 
     :raises Exception: what an agent died of
     """
@@ -212,7 +215,9 @@ def _watch(work: Sequence[Future[Path]], agents: Mapping[str, Agent]) -> None:
         returns = [demo_agents.episodes(agent.folder) for agent in agents.values()]
         played = min(map(len, returns))
         for at in range(told, played):
-            print(f"{(at + 1) * EPISODE:>8}" + "".join(f"{each[at]:>15.0f}" for each in returns), flush=True)
+            seconds = left.seconds(played * EPISODE, time.monotonic()) if at + 1 == played and not over else None
+            words = "" if seconds is None else f"{pace.in_words(seconds):>20}"
+            print(f"{(at + 1) * EPISODE:>8}" + "".join(f"{each[at]:>15.0f}" for each in returns) + words, flush=True)
         told = played
         if over:
             return

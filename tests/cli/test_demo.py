@@ -99,7 +99,32 @@ def test_what_an_agent_dies_of_is_told(tmp_path):
             raise OSError("no space left on device")
 
     with pytest.raises(OSError, match="no space left"):
-        side_by_side._watch([Dead()], agents)
+        side_by_side._watch([Dead()], agents, pace.Left(float, 0.0, 1000))
+
+
+def test_what_is_left_is_told_while_they_learn(tmp_path, monkeypatch, capsys):
+    """Ten seconds an episode; two are left, and five seconds after them."""
+    clock, played = iter([0.0, 10.0, 20.0]), iter([[1.0], [1.0, 2.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]])
+
+    class Working:
+        def done(self):
+            self.looks = getattr(self, "looks", 0) + 1
+            return self.looks > 6  # two calls a look
+
+        def result(self):
+            return tmp_path
+
+    monkeypatch.setattr(side_by_side, "LOOK", 0.0)
+    monkeypatch.setattr(side_by_side.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(demo_agents, "episodes", lambda folder: next(played))
+    agents = {SCRATCH: Agent(tmp_path, "urlb/walker-run-v0", 5000, 0, "tiny")}
+    side_by_side._watch([Working()], agents, pace.Left(lambda frames: frames / 1000, 0.5, 5000))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines] == [
+        ["1000", "1"],
+        ["2000", "2", "about", "35", "seconds"],
+        ["3000", "3", "about", "25", "seconds"],
+    ]
 
 
 def test_half_written_episodes_are_not_read(tmp_path):
@@ -114,7 +139,7 @@ def test_half_written_episodes_are_not_read(tmp_path):
 def fitted(monkeypatch, update, **config):
     monkeypatch.setattr(pace, "measure", lambda *_: Pace(update, 0.0, 0.0, 0.0))
     monkeypatch.setattr(side_by_side, "_at_once", lambda: 2)
-    return side_by_side.fitted(DemoConfig(**config))
+    return side_by_side.fitted(DemoConfig(**config))[0]
 
 
 def test_a_slow_machine_takes_fewer_frames_and_says_so(monkeypatch, capsys):

@@ -48,10 +48,21 @@ def test_a_share_fits_or_is_the_least(whole, limit, least):
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0.2, "about 1 seconds"), (75, "about 75 seconds"), (840, "about 14 minutes"), (9000, "about 2.5 hours")],
+    [(0.2, "about 1 second"), (75, "about 75 seconds"), (840, "about 14 minutes"), (9000, "about 2.5 hours")],
 )
 def test_durations_in_words(seconds, words):
     assert pace.in_words(seconds) == words
+
+
+@given(st.floats(0.1, 50), st.integers(1, 10), st.integers(1, 10))
+def test_what_is_left_follows_the_pace_so_far(slower, first, further):
+    """Two seconds a frame, three after the last of 20, all of it slower than expected; the start is no pace."""
+    left = pace.Left(lambda frames: 2.0 * frames, 3.0, 20)
+    assert left.seconds(first, 1e4) is None
+    assert left.seconds(first, 2e4) is None  # nothing was learnt meanwhile
+    done = first + further
+    now = 1e4 + slower * 2 * further
+    assert left.seconds(done, now) == pytest.approx(slower * (2 * (20 - done) + 3))
 
 
 def fitted(monkeypatch, config, update):

@@ -1,0 +1,93 @@
+"""Environments that do not keep to their spaces or to Gymnasium's interface: the error says what finds the breach."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb.mistakes import tell
+
+BOX = spaces.Box(-1, 1, (3,), np.float32)
+
+
+class Kept(gymnasium.Env):
+    """Keeps to everything; subclasses break one rule each."""
+
+    observation_space = BOX
+    action_space = spaces.Discrete(2)
+
+    def seen(self):
+        return self.observation_space.sample()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.seen(), {}
+
+    def step(self, action):
+        return self.seen(), 0.0, False, False, {}
+
+
+class OldReset(Kept):
+    def reset(self):
+        return self.seen()
+
+
+class OldStep(Kept):
+    def step(self, action):
+        return self.seen(), 0.0, False, {}
+
+
+class OtherShape(Kept):
+    def seen(self):
+        return np.zeros(4, np.float32)
+
+
+class NoReward(Kept):
+    def step(self, action):
+        return self.seen(), None, False, False, {}
+
+
+class MissingPart(Kept):
+    observation_space = spaces.Dict({"arm": BOX, "leg": BOX})
+
+    def seen(self):
+        return {"arm": np.zeros(3, np.float32)}
+
+
+BROKEN = [OldReset, OldStep, OtherShape, NoReward, MissingPart]
+
+
+@pytest.mark.parametrize("given", [lambda env: env(), lambda env: DummyVecEnv([env])], ids=["plain", "vectorised"])
+@pytest.mark.parametrize("env", BROKEN, ids=lambda env: env.__name__)
+def test_an_error_says_what_finds_the_breach(env, given, capsys):
+    policy = "MultiInputPolicy" if env is MissingPart else "MlpPolicy"
+    model = DreamerV2(policy, given(env), preset="tiny", device="cpu")
+    if env is NoReward and isinstance(model.env.envs[0], NoReward):
+        # Without a Monitor numpy takes it for NaN.
+        with pytest.raises(ValueError, match="Environment 0, step 1: .*reward.*expected finite numbers"):
+            model.learn(4)
+        return
+    with pytest.raises((TypeError, ValueError, KeyError)) as raised:
+        model.learn(4)
+    (note,) = raised.value.__notes__
+    asked = "step" if env in (OldStep, NoReward) else "reset"
+    assert f"asked to {asked}. stable_baselines3.common.env_checker.check_env(env) tells" in note
+    tell("a-command", raised.value)
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "check_env(env)" in error
+
+
+def test_other_errors_are_left_alone():
+    def fails(*_):
+        raise ValueError("of a callback")
+
+    model = DreamerV2("MlpPolicy", Kept(), preset="tiny", device="cpu")
+    for _ in range(2):
+        with pytest.raises(ValueError, match="of a callback") as raised:
+            model.learn(4, callback=fails)
+        assert not hasattr(raised.value, "__notes__")
+    assert model.learn(4).num_timesteps == 4
