@@ -12,6 +12,7 @@ from typing import Any
 
 from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
+from sb3_dreamer_urlb.unknown_names import did_you_mean
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
@@ -51,8 +52,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             text, add_arguments, _ = OTHERS[name]
             add_arguments(commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}."))
-    options = {name: value for name, value in vars(parser.parse_args(argv)).items() if value is not None}
+    parsed, unknown = parser.parse_known_args(argv)
+    options = {name: value for name, value in vars(parsed).items() if value is not None}
     command = options.pop("command")
+    if unknown:
+        its = commands.choices[command]
+        wrong = [text.split("=")[0] for text in unknown if text.startswith("-")]
+        its.error(f"unrecognized arguments: {' '.join(unknown)}.{did_you_mean(wrong, its._option_string_actions)}")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.

@@ -1,10 +1,12 @@
-"""What works, and is most likely not meant: warnings when a model is made, given an environment, or fine-tuned."""
+"""What works, and is most likely not meant: warnings when a model is made, given an environment, trained or fine-tuned."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Mapping
 from typing import Any
+
+import numpy as np
 
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.replay.episode_buffer import MAX_EPISODE_ROWS
@@ -43,6 +45,21 @@ def warn_if_no_episode_fits(model: Any) -> None:
             f"buffer_size={model.buffer_size} holds no whole episode, only the last rows of one: the environment's have up to "
             f"{steps} steps, which are {steps + 1} rows."
         )
+
+
+def warn_if_pictures_are_black(seen: Any) -> None:
+    """Where an environment gives numbers in [0, 1] as bytes, whose white is 255.
+
+    :param seen: observations of all environments, (n_envs, …), or such by name
+    """
+    for name, part in (seen.items() if isinstance(seen, Mapping) else [(None, seen)]):
+        if part.dtype == np.uint8 and part.ndim > 3 and part.max() <= 1:
+            what = "The observation" if name is None else f"Observation {name!r}"
+            warnings.warn(
+                f"{what} is a picture of uint8 with no number above 1: it is black to the agent. White is 255; numbers in "
+                "[0, 1] are multiplied by it, or belong to a Box of float32, channels first, with "
+                'policy_kwargs={"normalize_images": False}.'
+            )
 
 
 def warn_of_preset(preset: str, made_for: Mapping[str, Collection[str]], sees_images: bool) -> None:

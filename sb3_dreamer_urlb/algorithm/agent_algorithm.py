@@ -11,6 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.noise import ActionNoise
 
+from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.algorithm import advice
 from sb3_dreamer_urlb.algorithm.checks import check_scheduled_rate
 from sb3_dreamer_urlb.algorithm.phased import PhasedAlgorithm
@@ -186,6 +187,8 @@ class AgentAlgorithm(PhasedAlgorithm):
         """
         if not self.replay_buffer.can_sample():
             return
+        if self.learner.updates == 0:
+            advice.warn_if_pictures_are_black(self._last_obs)
         self._prepare_updates()
         self.policy.set_training_mode(True)
         self._set_learning_rates()
@@ -196,7 +199,12 @@ class AgentAlgorithm(PhasedAlgorithm):
             self.replay_buffer.prefetch(batch_size, self._drawn_through())
         self._n_updates += gradient_steps
         self.phase_updates = self.learner.updates
-        self.learner.guard.stop_if_repeated(self.num_timesteps)
+        self.learner.guard.stop_if_repeated(self.num_timesteps, self._rewarded_by())
+
+    def _rewarded_by(self) -> str:
+        """What the behaviour learns from, for messages: the intrinsic reward's class while it explores, else the task."""
+        explores = self.phase == phases.PRETRAINING
+        return f"the intrinsic reward {type(self.policy.agent.intrinsic).__name__}" if explores else "the task's reward"
 
     def _set_learning_rates(self) -> None:
         # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.

@@ -277,7 +277,7 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
             callbacks.on_training_start(locals(), globals())
             due = UpdatesDue(self, total_timesteps)
             try:
-                training_loop.learn(self, total_timesteps, callbacks, log_interval, self._update, self.overlap)
+                training_loop.learn(self, total_timesteps, callbacks, log_interval, due.paced(self._update), self.overlap)
             except (EnvironmentFaultError, NumericalFaultError) as error:
                 raise type(error)(f"{error} {save_last_good_state(self)}") from error
             due.ended()

@@ -1,18 +1,25 @@
-"""A ``learn`` without a single update teaches nothing: it is told, before it begins where that is known."""
+"""What there is to tell about the updates of a ``learn``: that there will be none, or that they will take days."""
 
 from __future__ import annotations
 
 import math
+import time
 import warnings
+from collections.abc import Callable
 
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_dreamer_urlb.algorithm.advice import NoUpdateWarning
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 
+#: hours that a ``learn`` on a CPU may still take without a word
+LONG = 24.0
+#: rollouts with updates whose pace is taken, after the first, in which kernels are compiled
+PACED = 4
+
 
 class UpdatesDue:
-    """Watches one ``learn``, and warns at once if it will end within the warm-up of its phase.
+    """Watches one ``learn``: warns at once if it will end within the warm-up of its phase, and soon if it will take days.
 
     :param model: about to learn
     :param total_timesteps: at which it ends, as ``num_timesteps`` counts
@@ -32,6 +39,38 @@ class UpdatesDue:
             self.told = True
             warning = f"This learn() will hold no update: it ends after {end} agent steps of {model.phase}, {self._warm_up}"
             warnings.warn(warning, NoUpdateWarning)
+
+    def paced(self, update: Callable[[int, int], None]) -> Callable[[int, int], None]:
+        """The updates of a rollout, by whose pace a long ``learn`` on a CPU is told: there somebody may have meant other sizes.
+
+        :param update: what the training loop calls
+        :return: what it is to call in its place
+        """
+        model, times, steps = self.model, list[float](), list[int]()
+
+        def updating(collected: int, ahead: int) -> None:
+            before = model._n_updates
+            update(collected, ahead)
+            if len(times) > PACED or model._n_updates == before or model.device.type != "cpu":
+                return
+            times.append(time.monotonic())
+            steps.append(model.num_timesteps)
+            if len(times) > PACED:
+                self._tell_if_long((times[-1] - times[0]) / max(steps[-1] - steps[0], 1))
+
+        return updating
+
+    def _tell_if_long(self, seconds: float) -> None:
+        """
+        :param seconds: an agent step, updates included
+        """
+        left = self.total_timesteps - self.model.num_timesteps
+        if (hours := left * seconds / 3600) > LONG:
+            preset = getattr(self.model, "preset", None)
+            warnings.warn(
+                f"At its pace so far this learn() will take another {hours:.0f} hours for {left} agent steps, on a CPU. A GPU, "
+                f"fewer updates (train_freq), or a preset smaller than {preset!r} take less."
+            )
 
     def ended(self) -> None:
         """Warn if there was none, unless a callback ended it early."""

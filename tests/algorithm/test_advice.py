@@ -83,6 +83,18 @@ def test_what_wrappers_made_of_a_picture(algorithm, shape, cure):
         algorithm("CnnPolicy", seeing(spaces.Box(0, 255, shape, np.uint8)), preset="tiny")
 
 
+@each
+@pytest.mark.parametrize(("white", "said_of"), [(0, True), (1, True), (2, False), (255, False)])
+def test_pictures_of_numbers_up_to_one_are_black(algorithm, white, said_of):
+    env = gymnasium.wrappers.TransformObservation(
+        seeing(IMAGE, 20), lambda seen: np.full_like(seen, white), observation_space=IMAGE
+    )
+    _, said = told(lambda: algorithm("CnnPolicy", env, preset="tiny", device="cpu").learn(60))
+    assert len(said) == said_of
+    if said_of:
+        assert said[0].startswith("The observation is a picture of uint8 with no number above 1: it is black")
+
+
 # -- presets ---------------------------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,9 @@
 """Whoever asks for a learn() that cannot learn is told."""
 
+import itertools
+import re
+from types import SimpleNamespace
+
 import pytest
 from fake_envs import CounterEnv
 from hypothesis import given, settings
@@ -9,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from told import told_meanwhile
 
 from sb3_dreamer_urlb import DrQv2
+from sb3_dreamer_urlb.algorithm import updates_due
 
 
 def told(model, steps: int, callback=None) -> list[str]:
@@ -23,6 +28,17 @@ class Stops(BaseCallback):
 
     def _on_step(self) -> bool:
         return False
+
+
+class StopsAt(BaseCallback):
+    """At some step."""
+
+    def __init__(self, step: int):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        return self.n_calls < self.step
 
 
 @given(
@@ -76,3 +92,19 @@ def test_a_fine_tuning_of_fresh_networks_says_so(tiny_model, steps):
 def test_who_wants_none_is_left_in_peace(tiny_model, reason):
     model = tiny_model(learning_starts=0, gradient_steps=0 if reason == "no updates wanted" else 1)
     assert told(model, 0 if reason == "no steps" else 8, Stops() if reason.startswith("ended") else None) == []
+
+
+@pytest.mark.parametrize(("hours", "told_of"), [(23.0, False), (50.0, True)])
+def test_days_on_a_cpu_are_told_once(tiny_model, monkeypatch, hours, told_of):
+    """By the pace of a few rollouts, of which the first does not count."""
+    model = tiny_model(CounterEnv(5), learning_starts=10, train_freq=2)
+    clock = itertools.count(0.0, 2 * hours * 3600 / 1000)
+    monkeypatch.setattr(updates_due, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    stop = StopsAt(60)
+    with told_meanwhile() as told_now:
+        model.learn(1000, stop)
+    long = [text for text in told_now if "hours" in text]
+    assert len(long) == told_of
+    if told_of:
+        left = int(re.search(r"for (\d+) agent steps, on a CPU", long[0])[1])
+        assert 940 < left < 1000 and f"another {hours * left / 1000:.0f} hours" in long[0] and "than 'tiny'" in long[0]

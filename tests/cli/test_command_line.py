@@ -28,3 +28,17 @@ def test_help_is_plain_text_that_says_what_it_is(command, capsys):
     head, _, about = text.partition("\n\n")
     assert head.startswith("usage: sb3-dreamer-urlb") and "`" not in text and not re.search(r":\w+:`", text)
     assert re.match(r"[A-Z].+\.$", " ".join(about.split("\n\n")[0].split()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["demo", "--episods", "3"], "unrecognized arguments: --episods 3. Did you mean '--episodes'?"),
+        (["demo", "--pretrain-frmes=3", "x"], "unrecognized arguments: --pretrain-frmes=3 x. Did you mean '--pretrain-frames'"),
+        (["demo", "flip"], "unrecognized arguments: flip."),
+    ],
+)
+def test_unknown_options_are_answered_with_near_ones_of_the_command(capsys, arguments, message):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(arguments)
+    assert f"\nsb3-dreamer-urlb demo: error: {message}" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,8 +115,7 @@ def test_what_is_left_is_told_while_they_learn(tmp_path, monkeypatch, capsys):
         def result(self):
             return tmp_path
 
-    monkeypatch.setattr(side_by_side, "LOOK", 0.0)
-    monkeypatch.setattr(side_by_side.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(side_by_side, "time", SimpleNamespace(monotonic=lambda: next(clock), sleep=lambda _: None))
     monkeypatch.setattr(demo_agents, "episodes", lambda folder: next(played))
     agents = {SCRATCH: Agent(tmp_path, "urlb/walker-run-v0", 5000, 0, "tiny")}
     side_by_side._watch([Working()], agents, pace.Left(lambda frames: frames / 1000, 0.5, 5000))

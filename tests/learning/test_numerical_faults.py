@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_dreamer_urlb import DreamerV2, NumericalFaultError, RunCheckpointCallback
+from sb3_dreamer_urlb import DreamerV2, IntrinsicReward, NumericalFaultError, RunCheckpointCallback
 from sb3_dreamer_urlb.intrinsic.registry import registered_intrinsic_rewards
 from sb3_dreamer_urlb.learning.numerical_faults import MAX_IN_A_ROW
 from sb3_dreamer_urlb.learning.optim import ClippedAdam
@@ -207,6 +207,23 @@ def test_many_in_a_row_end_the_run_with_a_snapshot(tiny_model, tmp_path):
     assert last_good and all(th.equal(value, last_good[name]) for name, value in loaded.policy.state_dict().items())
     loaded.learn(40, reset_num_timesteps=False)
     assert loaded._n_updates > model._n_updates
+
+
+class Broken(IntrinsicReward):
+    """Divides by zero."""
+
+    def reward(self, imagination, reward_head):
+        return imagination.feature[..., 0] / 0
+
+
+def test_a_reward_that_is_no_number_is_named(tiny_model):
+    """The model learns on; the behaviour does not, and what it is paid with may be why."""
+    model = tiny_model(train_freq=1, intrinsic_reward=Broken())
+    before = copy.deepcopy(model.policy.agent.world_model.state_dict())
+    with pytest.raises(NumericalFaultError, match=r"of the actor and the critic was not finite. The intrinsic reward Broken"):
+        model.learn(1000)
+    after = model.policy.agent.world_model.state_dict()
+    assert not all(th.equal(value, before[name]) for name, value in after.items())
 
 
 @pytest.mark.parametrize("overlap", [True, False])
