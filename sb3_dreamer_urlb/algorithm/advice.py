@@ -52,7 +52,7 @@ def warn_if_pictures_are_black(seen: Any) -> None:
 
     :param seen: observations of all environments, (n_envs, …), or such by name
     """
-    for name, part in (seen.items() if isinstance(seen, Mapping) else [(None, seen)]):
+    for name, part in seen.items() if isinstance(seen, Mapping) else [(None, seen)]:
         if part.dtype == np.uint8 and part.ndim > 3 and part.max() <= 1:
             what = "The observation" if name is None else f"Observation {name!r}"
             warnings.warn(

@@ -34,7 +34,10 @@ def test_help_is_plain_text_that_says_what_it_is(command, capsys):
     ("arguments", "message"),
     [
         (["demo", "--episods", "3"], "unrecognized arguments: --episods 3. Did you mean '--episodes'?"),
-        (["demo", "--pretrain-frmes=3", "x"], "unrecognized arguments: --pretrain-frmes=3 x. Did you mean '--pretrain-frames'"),
+        (
+            ["demo", "--pretrain-frmes=3", "x"],
+            "unrecognized arguments: --pretrain-frmes=3 x. Did you mean '--pretrain-frames'",
+        ),
         (["demo", "flip"], "unrecognized arguments: flip."),
     ],
 )
