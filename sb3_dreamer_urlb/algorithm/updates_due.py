@@ -41,7 +41,7 @@ class UpdatesDue:
             warnings.warn(warning, NoUpdateWarning)
 
     def paced(self, update: Callable[[int, int], None]) -> Callable[[int, int], None]:
-        """The updates of a rollout, by whose pace a long ``learn`` on a CPU is told: there somebody may have meant other sizes.
+        """The updates of a rollout, by whose pace a long ``learn`` on a CPU is told: there other sizes may be meant.
 
         :param update: what the training loop calls
         :return: what it is to call in its place
@@ -68,8 +68,8 @@ class UpdatesDue:
         if (hours := left * seconds / 3600) > LONG:
             preset = getattr(self.model, "preset", None)
             warnings.warn(
-                f"At its pace so far this learn() will take another {hours:.0f} hours for {left} agent steps, on a CPU. A GPU, "
-                f"fewer updates (train_freq), or a preset smaller than {preset!r} take less."
+                f"At its pace so far this learn() will take another {hours:.0f} hours for {left} agent steps, on a CPU. A "
+                f"GPU, fewer updates (train_freq), or a preset smaller than {preset!r} take less."
             )
 
     def ended(self) -> None:

@@ -68,7 +68,7 @@ def test_an_error_says_what_finds_the_breach(env, given, capsys):
     model = DreamerV2(policy, given(env), preset="tiny", device="cpu")
     if env is NoReward and isinstance(model.env.envs[0], NoReward):
         # Without a Monitor numpy takes it for NaN.
-        with pytest.raises(ValueError, match="Environment 0, step 1: .*reward.*expected finite numbers"):
+        with pytest.raises(ValueError, match=r"Environment 0, step 1: .*reward.*expected finite numbers"):
             model.learn(4)
         return
     with pytest.raises((TypeError, ValueError, KeyError)) as raised:
