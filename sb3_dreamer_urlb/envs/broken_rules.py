@@ -32,6 +32,7 @@ def annotate(error: BaseException, what: str) -> None:
     :param error: of an environment
     :param what: it was asked to do
     """
-    note = NOTE.format(what=what)
-    if note not in getattr(error, "__notes__", ()):
-        error.add_note(note)
+    notes, note = getattr(error, "__notes__", []), NOTE.format(what=what)
+    if note not in notes:
+        # What Exception.add_note does from Python 3.11 on; 3.10 prints no notes, and commands do.
+        error.__notes__ = [*notes, note]  # type: ignore[attr-defined]
