@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
+from sb3_dreamer_urlb.envs.wrappers import put_around
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, pictures_in
 from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 from sb3_dreamer_urlb.types import Observation
@@ -80,6 +82,9 @@ def _same_again(model: AgentAlgorithm, argument: str) -> gymnasium.Env[Any, Any]
     if train_env is None or spec is None:
         raise ValueError(f"Another environment like the model's cannot be made, as it has no registered id: give {argument}.")
     kwargs = {**spec.kwargs}
+    if around := put_around(train_env, spec):
+        names = ", ".join(each.kind.rpartition(".")[2] for each in around)
+        warnings.warn(f"An environment like the model's is made to play in, without its wrappers ({names}): give {argument}.")
     if "rgb_array" in env_attribute(train_env, "metadata", {}).get("render_modes", ()):
         kwargs["render_mode"] = "rgb_array"
     return gymnasium.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)

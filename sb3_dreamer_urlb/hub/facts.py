@@ -7,10 +7,13 @@ from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
+from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.privacy import plain_for_everybody, without_private_paths
+from sb3_dreamer_urlb.hub.wrappers import wrappers_of
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.planning import planner_name
 from sb3_dreamer_urlb.snapshots import values
@@ -50,6 +53,7 @@ class ModelFacts:
     :param command: that made it, None if nobody said
     :param algorithm: name of its class
     :param env_kwargs: what ``gymnasium.make`` was told beside the id, as JSON
+    :param wrappers: around the environment, innermost first, as calls
     :param own_parts: by constructor argument, a planner of one's own, say
     """
 
@@ -65,17 +69,20 @@ class ModelFacts:
     command: str | None
     algorithm: str
     env_kwargs: dict[str, Any]
+    wrappers: list[str]
     own_parts: dict[str, OwnPart]
 
 
-def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, spec: EnvSpec | None = None) -> ModelFacts:
+def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, env: VecEnv | None = None) -> ModelFacts:
     """What a model knows about itself.
 
     :param model: trained
     :param env_id: of the environment that it was evaluated in
     :param command: that made it
-    :param spec: that the environment was made by
+    :param env: that it was evaluated in
     """
+    learnt_in = model.get_env() or env
+    spec = None if env is None else env_attribute(env, "spec", None)
     reward = model.intrinsic_reward
     name = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
     exploring = model.phase == PRETRAINING
@@ -93,6 +100,7 @@ def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, spec: E
         command=None if command is None else without_private_paths(command),
         algorithm=algorithm_of(model).name,
         env_kwargs={} if spec is None or spec.id != env_id else environment_arguments(spec),
+        wrappers=[] if learnt_in is None else wrappers_of(learnt_in, env_attribute(learnt_in, "spec", None)),
         own_parts=own_parts(model),
     )
 

@@ -102,6 +102,7 @@ def model_card(
     how = "deterministic" if evaluation.is_deterministic else "stochastic"
     rows = {
         "environment": f"`{facts.env_id}`" + (f" with `{as_arguments(facts.env_kwargs)}`" if facts.env_kwargs else ""),
+        **({"wrappers": ", ".join(f"`{wrapper}`" for wrapper in facts.wrappers)} if facts.wrappers else {}),
         "domain": facts.domain or "not stated by the environment",
         "method of pre-training": facts.method if facts.method == FROM_SCRATCH else f"`{facts.method}`",
         "phase": "pre-training: the task's reward was not used" if facts.phase == PRETRAINING else "trained on the task",

@@ -102,7 +102,7 @@ def package_to_hub(
             normalizer = unwrap_vec_normalize(env)
             if normalizer is not None:
                 save_vec_normalize(normalizer, folder / STATISTICS)
-            facts = facts_about(model, env_id, command, _spec_of(env))
+            facts = facts_about(model, env_id, command, env)
             card = cards.model_card(model, facts, evaluation, repository.shown, normalizer is not None, filmed)
             (folder / CARD).write_text(card)
             (folder / CONFIG).write_text(json.dumps(cards.config(facts, model_file), indent=1))

@@ -37,6 +37,8 @@ def usage(facts: ModelFacts, repo_name: str, normalized: bool) -> str:
         f"from sb3_dreamer_urlb.hub import {names}",
         "",
         f"env = {env}",
+        *(["# The model saw it through these, innermost first: put them around it, too."] if facts.wrappers else []),
+        *(f"# {wrapper}" for wrapper in facts.wrappers),
         *how_to_give(facts.own_parts),
         f"model = {facts.algorithm}.load(load_from_hub({json.dumps(repo_name)}), env=env)",
     ]

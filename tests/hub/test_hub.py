@@ -23,7 +23,7 @@ from huggingface_hub.errors import RemoteEntryNotFoundError
 from snapshot_files import code_events
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 import sb3_dreamer_urlb
 from sb3_dreamer_urlb import DreamerV2, DrQv2, PlannerConfig, SnapshotError, register_intrinsic_reward, register_planner
@@ -533,9 +533,47 @@ def test_the_cards_code_makes_the_environment_with_the_same_arguments(tiny_model
     assert json.loads((tmp_path / "config.json").read_text())["env_kwargs"] == told
 
 
+class Unrecorded(gymnasium.Wrapper):
+    """Says nothing of its arguments."""
+
+    def __init__(self, env, depth):
+        super().__init__(env)
+        self.depth = depth
+
+
+class Passing(VecEnvWrapper):
+    """Changes nothing."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_the_card_names_wrappers(tiny_model, tmp_path):
+    """Those that somebody put around; neither those of gymnasium.make and of the model, nor what is in the model's file."""
+    plain = VecNormalize(make_vec_env(VECTORS, wrapper_class=Unrecorded, wrapper_kwargs={"depth": 3}), norm_reward=False)
+    model = tiny_model(Passing(Passing(plain)), "MlpPolicy").learn(8)
+    with pytest.warns(UserWarning, match=r"without its wrappers \(Unrecorded, Passing, Passing\): give eval_env"):
+        package_to_hub(model, tmp_path / "vectors", n_eval_episodes=1, video_length=0)
+    found = json.loads((tmp_path / "vectors" / "config.json").read_text())["wrappers"]
+    assert found == [f"{__name__}.Unrecorded(env, ...)", *[f"{__name__}.Passing(env, ...)"] * 2]
+    watched = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make(VECTORS))
+    wrapped = gymnasium.wrappers.TransformReward(gymnasium.wrappers.FrameStackObservation(watched, 2), abs)
+    model = tiny_model(wrapped, "MlpPolicy").learn(8)
+    package_to_hub(model, tmp_path / "recorded", wrapped, n_eval_episodes=1, video_length=0)
+    first, second = json.loads((tmp_path / "recorded" / "config.json").read_text())["wrappers"]
+    assert re.fullmatch(r"gymnasium\.wrappers\.[\w.]+\.FrameStackObservation\(env, stack_size=2, .*\)", first)
+    assert re.fullmatch(r"gymnasium\.wrappers\.[\w.]+\.TransformReward\(env, func=\.\.\.\)", second)
+    text = card(tmp_path / "recorded").text
+    assert f"| wrappers | `{first}`, `{second}` |" in text and f"# {first}\n# {second}\nmodel = " in text
+
+
 def test_a_usual_environment_needs_no_arguments(model, tmp_path):
     package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
-    assert 'env = gymnasium.make("test/Counter-v0")\n' in card(tmp_path).text
+    text = card(tmp_path).text
+    assert 'env = gymnasium.make("test/Counter-v0")\n' in text and "wrappers" not in text
 
 
 class OwnPlanner(DynaMPC):
