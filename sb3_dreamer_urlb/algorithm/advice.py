@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
 from sb3_dreamer_urlb.replay.episode_buffer import MAX_EPISODE_ROWS
@@ -47,13 +49,16 @@ def warn_if_no_episode_fits(model: Any) -> None:
         )
 
 
-def warn_if_pictures_are_black(seen: Any) -> None:
+def warn_if_pictures_are_black(seen: Any, space: spaces.Space[Any]) -> None:
     """Where an environment gives numbers in [0, 1] as bytes, whose white is 255.
 
     :param seen: observations of all environments, (n_envs, …), or such by name
+    :param space: of one; a Box of bytes up to 1 says what it holds
     """
-    for name, part in seen.items() if isinstance(seen, Mapping) else [(None, seen)]:
-        if part.dtype == np.uint8 and part.ndim > 3 and part.max() <= 1:
+    several = isinstance(space, spaces.Dict)
+    parts = [(name, seen[name], its) for name, its in space.items()] if several else [(None, seen, space)]
+    for name, part, its in parts:
+        if is_image_space(its) and np.asarray(part).max() <= 1:
             what = "The observation" if name is None else f"Observation {name!r}"
             warnings.warn(
                 f"{what} is a picture of uint8 with no number above 1: it is black to the agent. White is 255; numbers in "

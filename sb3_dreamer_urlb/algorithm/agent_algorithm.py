@@ -188,7 +188,7 @@ class AgentAlgorithm(PhasedAlgorithm):
         if not self.replay_buffer.can_sample():
             return
         if self.learner.updates == 0:
-            advice.warn_if_pictures_are_black(self._last_obs)
+            advice.warn_if_pictures_are_black(self._last_obs, self.observation_space)
         self._prepare_updates()
         self.policy.set_training_mode(True)
         self._set_learning_rates()

@@ -95,6 +95,21 @@ def test_pictures_of_numbers_up_to_one_are_black(algorithm, white, said_of):
         assert said[0].startswith("The observation is a picture of uint8 with no number above 1: it is black")
 
 
+@each
+def test_planes_whose_space_ends_at_one_are_what_they_say(algorithm):
+    board = spaces.Box(0, 1, (8, 8, 12), np.uint8)
+    assert told(lambda: algorithm("MlpPolicy", seeing(board, 20), preset="tiny", device="cpu").learn(60))[1] == []
+
+
+def test_a_black_picture_among_others_is_named():
+    both = spaces.Dict({"board": spaces.Box(0, 1, (8, 8, 3), np.uint8), "camera": IMAGE})
+    env = gymnasium.wrappers.TransformObservation(
+        seeing(both, 20), lambda _: {name: np.ones_like(part.sample()) for name, part in both.items()}, observation_space=both
+    )
+    _, said = told(lambda: DreamerV2("MultiInputPolicy", env, preset="tiny", device="cpu").learn(60))
+    assert [text.split(" is a picture")[0] for text in said if "black" in text] == ["Observation 'camera'"]
+
+
 # -- presets ---------------------------------------------------------------------------------------------------------------
 
 
