@@ -55,10 +55,10 @@ def warn_if_pictures_are_black(seen: Any, space: spaces.Space[Any]) -> None:
     :param seen: observations of all environments, (n_envs, …), or such by name
     :param space: of one; a Box of bytes up to 1 says what it holds
     """
-    several = isinstance(space, spaces.Dict)
-    parts = [(name, seen[name], its) for name, its in space.items()] if several else [(None, seen, space)]
-    for name, part, its in parts:
-        if is_image_space(its) and np.asarray(part).max() <= 1:
+    its = space.spaces if isinstance(space, spaces.Dict) else {None: space}
+    for name, one in its.items():
+        part = seen if name is None else seen[name]
+        if is_image_space(one) and np.asarray(part).max() <= 1:
             what = "The observation" if name is None else f"Observation {name!r}"
             warnings.warn(
                 f"{what} is a picture of uint8 with no number above 1: it is black to the agent. White is 255; numbers in "
