@@ -204,7 +204,7 @@ class AgentAlgorithm(PhasedAlgorithm):
     def _rewarded_by(self) -> str:
         """What the behaviour learns from, for messages: the intrinsic reward's class while it explores, else the task."""
         explores = self.phase == phases.PRETRAINING
-        return f"the intrinsic reward {type(self.policy.agent.intrinsic).__name__}" if explores else "the task's reward"
+        return f"The intrinsic reward {type(self.policy.agent.intrinsic).__name__}" if explores else "The task's reward"
 
     def _set_learning_rates(self) -> None:
         # The last rollout may overshoot the total, and a schedule of a negative rest would ascend.

@@ -46,8 +46,7 @@ class LearningVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         """As the environments'."""
-        with asking_to("reset"):
-            return self.venv.reset()
+        return self.venv.reset()
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions."""

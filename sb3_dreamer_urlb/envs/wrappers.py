@@ -11,6 +11,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, VecNormalize, VecTransposeImage
 
+from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.faults import FaultGuard
 
 #: change nothing that an agent sees or does
@@ -31,13 +32,12 @@ class Around:
     kwargs: dict[str, Any] | None
 
 
-def put_around(env: VecEnv | None, spec: EnvSpec | None) -> list[Around]:
+def put_around(env: VecEnv) -> list[Around]:
     """Those that neither ``gymnasium.make`` nor the model puts around by itself, and that change something; innermost first.
 
-    :param env: vectorised
-    :param spec: of what it holds
+    :param env: vectorised; of what it holds, the spec tells
     """
-    return [*_one_by_one(spec), *_vectorised(env)]
+    return [*_one_by_one(env_attribute(env, "spec", None)), *_vectorised(env)]
 
 
 def _one_by_one(spec: EnvSpec | None) -> list[Around]:
@@ -50,7 +50,7 @@ def _one_by_one(spec: EnvSpec | None) -> list[Around]:
     return [each for each in found if each.kind not in watching]
 
 
-def _vectorised(env: VecEnv | None) -> list[Around]:
+def _vectorised(env: VecEnv) -> list[Around]:
     found = []
     while isinstance(env, VecEnvWrapper):
         if not isinstance(env, OF_THEMSELVES):

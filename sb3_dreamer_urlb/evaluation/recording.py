@@ -82,7 +82,7 @@ def _same_again(model: AgentAlgorithm, argument: str) -> gymnasium.Env[Any, Any]
     if train_env is None or spec is None:
         raise ValueError(f"Another environment like the model's cannot be made, as it has no registered id: give {argument}.")
     kwargs = {**spec.kwargs}
-    if around := put_around(train_env, spec):
+    if around := put_around(train_env):
         names = ", ".join(each.kind.rpartition(".")[2] for each in around)
         warnings.warn(f"An environment like the model's is made to play in, without its wrappers ({names}): give {argument}.")
     if "rgb_array" in env_attribute(train_env, "metadata", {}).get("render_modes", ()):

@@ -73,7 +73,7 @@ class ModelFacts:
     own_parts: dict[str, OwnPart]
 
 
-def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, env: VecEnv | None = None) -> ModelFacts:
+def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, env: VecEnv) -> ModelFacts:
     """What a model knows about itself.
 
     :param model: trained
@@ -81,8 +81,7 @@ def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, env: Ve
     :param command: that made it
     :param env: that it was evaluated in
     """
-    learnt_in = model.get_env() or env
-    spec = None if env is None else env_attribute(env, "spec", None)
+    spec = env_attribute(env, "spec", None)
     reward = model.intrinsic_reward
     name = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
     exploring = model.phase == PRETRAINING
@@ -100,7 +99,7 @@ def facts_about(model: AgentAlgorithm, env_id: str, command: str | None, env: Ve
         command=None if command is None else without_private_paths(command),
         algorithm=algorithm_of(model).name,
         env_kwargs={} if spec is None or spec.id != env_id else environment_arguments(spec),
-        wrappers=[] if learnt_in is None else wrappers_of(learnt_in, env_attribute(learnt_in, "spec", None)),
+        wrappers=wrappers_of(model.get_env() or env),
         own_parts=own_parts(model),
     )
 

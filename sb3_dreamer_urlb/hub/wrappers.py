@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.envs.wrappers import Around, put_around
@@ -12,13 +11,12 @@ from sb3_dreamer_urlb.hub.privacy import plain_for_everybody
 from sb3_dreamer_urlb.snapshots import values
 
 
-def wrappers_of(env: VecEnv | None, spec: EnvSpec | None) -> list[str]:
+def wrappers_of(env: VecEnv) -> list[str]:
     """As calls, innermost first; ``...`` stands for arguments that are no plain values, or that nobody recorded.
 
     :param env: that the model learnt in
-    :param spec: of what it holds
     """
-    return [_as_call(each) for each in put_around(env, spec)]
+    return [_as_call(each) for each in put_around(env)]
 
 
 def _as_call(wrapper: Around) -> str:

@@ -93,14 +93,14 @@ class UpdateGuard:
         """End a run that no longer learns: its weights are those of the last good update, and ``learn`` saves them.
 
         :param step: for the message
-        :param rewarded_by: what the behaviour learns from, likewise
+        :param rewarded_by: what the behaviour learns from, likewise; it begins a sentence
         :raises NumericalFaultError: after ``MAX_IN_A_ROW`` skipped updates in a row, naming the parts
         """
         parts = [name.removesuffix("_optimizer") for name in self.repeated()]
         if not parts:
             return
         # The world model is none of them: its numbers are good, and so what they are paid with may be bad.
-        paid = f" {rewarded_by[0].upper()}{rewarded_by[1:]} may be what is not." if set(parts) <= BEHAVIOR else ""
+        paid = f" {rewarded_by} may be what is not." if set(parts) <= BEHAVIOR else ""
         raise NumericalFaultError(
             f"At step {step}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
             f"the {' and the '.join(parts)} was not finite.{paid} Smaller learning rates may help."
