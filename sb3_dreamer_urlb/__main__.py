@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
+from sb3_dreamer_urlb.command_parser import CommandParser
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
-from sb3_dreamer_urlb.unknown_names import did_you_mean
 from sb3_dreamer_urlb.version import __version__
 
 #: commands with a module of their own in ``cli``, which has ``HELP``, ``add_arguments(parser)`` and ``run(options)``
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process if None
     :return: exit status
     """
-    parser = argparse.ArgumentParser(prog="sb3-dreamer-urlb", description=DESCRIPTION)
+    parser = CommandParser(prog="sb3-dreamer-urlb", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
     modules = {name.replace("_", "-"): import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
@@ -56,9 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = {name: value for name, value in vars(parsed).items() if value is not None}
     command = options.pop("command")
     if unknown:
-        its = commands.choices[command]
-        wrong = [text.split("=")[0] for text in unknown if text.startswith("-")]
-        its.error(f"unrecognized arguments: {' '.join(unknown)}.{did_you_mean(wrong, its._option_string_actions)}")
+        commands.choices[command].error(f"unrecognized arguments: {' '.join(unknown)}.")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from unittest import mock
 
+from sb3_dreamer_urlb.command_parser import CommandParser
 from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import how_to_install
@@ -31,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process if None
     :return: exit status
     """
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="python -m sb3_dreamer_urlb.zoo",
         description="rl_zoo3 with --algo dreamerv2 or drq_v2.",
         epilog="\n".join(f"{name:14}{text}" for name, text in COMMANDS.items())

@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from sb3_dreamer_urlb.command_parser import CommandParser
 from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.hub.privacy import as_plain, plain_for_everybody
@@ -164,7 +165,7 @@ def harmless_config(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parser(prog: str, description: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=prog, description=description)
+    parser = CommandParser(prog=prog, description=description)
     parser.add_argument("--env", required=True, help="id of the environment")
     parser.add_argument("-f", "--folder", required=True, help="of the runs")
     parser.add_argument("--algo", default="dreamerv2", choices=sorted(ALGORITHMS))

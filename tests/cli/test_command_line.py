@@ -7,6 +7,7 @@ import re
 import pytest
 
 from sb3_dreamer_urlb.__main__ import MODULES, OTHERS, main
+from sb3_dreamer_urlb.zoo.__main__ import main as zoo
 
 COMMANDS = sorted({name.replace("_", "-") for name in MODULES} | set(OTHERS))
 
@@ -45,3 +46,27 @@ def test_unknown_options_are_answered_with_near_ones_of_the_command(capsys, argu
     with pytest.raises(SystemExit, match=r"^2$"):
         main(arguments)
     assert f"\nsb3-dreamer-urlb demo: error: {message}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "whose", "message"),
+    [
+        (["evaluate", "model.zip", "--evn", "CartPole-v1"], " evaluate", "required: --env. Did you mean '--env' or "),
+        (["figures", "--output", "x", "rows.csv"], " figures", "required: --out. Did you mean '--out'?"),
+        (["figures", "rows.csv"], " figures", "required: --out\n"),
+        (["evalute", "model.zip"], "", ". Did you mean 'evaluate'?"),
+        (["--verison"], "", ". Did you mean '--version'?"),
+        ([], "", "required: COMMAND\n"),
+    ],
+)
+def test_what_lacks_only_because_it_is_misspelt_is_told_so(capsys, arguments, whose, message):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(arguments)
+    last = capsys.readouterr().err.splitlines(keepends=True)[-1]
+    assert last.startswith(f"sb3-dreamer-urlb{whose}: error: ") and message in last
+
+
+def test_commands_for_the_zoo_are_answered_likewise(capsys):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        zoo(["trian", "--algo", "dreamerv2"])
+    assert capsys.readouterr().err.endswith(". Did you mean 'train'?\n")

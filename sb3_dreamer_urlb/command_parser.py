@@ -1,0 +1,46 @@
+"""A parser of command lines that answers wrong options and commands with near ones."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from sb3_dreamer_urlb.unknown_names import did_you_mean
+
+
+class CommandParser(argparse.ArgumentParser):
+    """argparse's, also for the commands below it. argparse says first what lacks, even where that was only misspelt."""
+
+    _words: Sequence[str] = ()
+
+    def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:
+        """As argparse's.
+
+        :param args: the words, those of the process if None
+        :param namespace: to put values into
+        """
+        self._words = list(sys.argv[1:] if args is None else args)
+        return super().parse_known_args(self._words, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """End the process with status 2, and a near name for each word that is none.
+
+        :param message: what is wrong
+        """
+        options = self._option_string_actions
+        wrong = [word.partition("=")[0] for word in self._words if word.startswith("--") and word != "--"]
+        # The beginning of an option is taken for it.
+        wrong = [name for name in wrong if not any(option.startswith(name) for option in options)]
+        near = did_you_mean(wrong, options) or did_you_mean(self._wrong_command(), self._commands())
+        super().error(message.rstrip(".") + "." + near if near else message)
+
+    def _commands(self) -> list[str]:
+        actions = self._get_positional_actions()
+        return [str(name) for action in actions[:1] if action.choices is not None for name in action.choices]
+
+    def _wrong_command(self) -> list[str]:
+        """The first word, where it should be one of few and is not."""
+        word = next((word for word in self._words if not word.startswith("-")), None)
+        return [word] if word is not None and word not in self._commands() else []
