@@ -14,9 +14,9 @@ import torch as th
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 
-#: ``"auto"``: from this size on bfloat16 is faster on a CPU with AMX tiles: the width of the model's features for each part
-#: (docs/notes/performance.md has the measurements). Elsewhere float32, until somebody has measured it there. Acting without a
-#: planner is one row at a time and always float32.
+#: ``"auto"``: from this size on bfloat16 is faster on a CPU with AMX tiles or AVX-512's products of bfloat16: the width of the
+#: model's features for each part (docs/notes/performance.md has the measurements). Elsewhere float32, until somebody has
+#: measured it there. Acting without a planner is one row at a time and always float32.
 AUTO_FEATURE_SIZE = {"update": 1024, "planner": 1024}
 
 
@@ -31,7 +31,7 @@ def choose(precision: str, part: str, device: th.device | str, feature_size: int
     """
     on_cpu = th.device(device).type == "cpu"
     if precision == "auto":
-        fast = on_cpu and _cpu_has_amx() and cpu_multiplies_short() and feature_size >= AUTO_FEATURE_SIZE[part]
+        fast = on_cpu and _cpu_has_short_products() and cpu_multiplies_short() and feature_size >= AUTO_FEATURE_SIZE[part]
         return th.bfloat16 if fast else th.float32
     if precision == "bfloat16" and on_cpu and not cpu_multiplies_short():
         _warn_of_slow_products()
@@ -92,8 +92,8 @@ def _warn_of_slow_products() -> None:
     )
 
 
-@functools.cache
-def _cpu_has_amx() -> bool:
-    # Private in every torch so far; without it nothing is known about the CPU.
-    probe = getattr(th.cpu, "_is_amx_tile_supported", None)
-    return bool(probe is not None and probe())
+def _cpu_has_short_products() -> bool:
+    # oneDNN alone would not do: with AVX-512 it takes bfloat16 also where it has to turn every number into float32 first.
+    # Private in every torch so far; without them nothing is known about the CPU.
+    probes = (getattr(th.cpu, name, None) for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"))
+    return any(probe is not None and probe() for probe in probes)

@@ -21,25 +21,28 @@ from sb3_dreamer_urlb.world_model.convolution_forms import Direct, Patches, Patc
 
 
 @pytest.fixture
-def amx(monkeypatch):
-    """A function that says whether the CPU has AMX tiles, and torch uses them."""
+def short_products(monkeypatch):
+    """A function that says by which of torch's names the CPU has products of bfloat16, and that torch uses them."""
 
     def say(has):
-        monkeypatch.setattr(precision, "_cpu_has_amx", lambda: has)
+        for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"):
+            monkeypatch.setattr(th.cpu, name, lambda name=name: name == has)
         monkeypatch.setattr(precision, "cpu_multiplies_short", lambda: True)
 
     return say
 
 
-def test_auto_asks_for_hardware_and_size(amx):
+def test_auto_asks_for_hardware_and_size(short_products):
     small, large = precision.AUTO_FEATURE_SIZE["update"] - 1, precision.AUTO_FEATURE_SIZE["update"]
     for has, size, device, expected in (
-        (True, large, "cpu", th.bfloat16),
-        (True, small, "cpu", th.float32),
-        (False, large, "cpu", th.float32),
-        (True, large, "cuda", th.float32),
+        ("_is_amx_tile_supported", large, "cpu", th.bfloat16),
+        ("_is_avx512_bf16_supported", large, "cpu", th.bfloat16),
+        ("_is_amx_tile_supported", small, "cpu", th.float32),
+        ("_is_avx512_bf16_supported", small, "cpu", th.float32),
+        ("neither", large, "cpu", th.float32),
+        ("_is_amx_tile_supported", large, "cuda", th.float32),
     ):
-        amx(has)
+        short_products(has)
         assert precision.choose("auto", "update", device, size) == expected
         assert precision.choose("float32", "update", device, size) == th.float32
         assert precision.choose("bfloat16", "update", device, size) == th.bfloat16
