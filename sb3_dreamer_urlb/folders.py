@@ -1,4 +1,4 @@
-"""Folders that are written into: where a file has the name, it is named before anything else is said."""
+"""Folders and files that are written: where one has the other's name, it is named before anything else is done."""
 
 from __future__ import annotations
 
@@ -31,3 +31,16 @@ def made_folder(argument: str, path: str | os.PathLike[str]) -> Path:
     check_folder(argument, path)
     Path(path).mkdir(parents=True, exist_ok=True)
     return Path(path)
+
+
+def check_file(argument: str, path: str | os.PathLike[str]) -> None:
+    """Whether a path is a file, or can become one: before the hours whose result it is for.
+
+    :param argument: what the path was given as, for the message
+    :param path: of the file
+    :raises IsADirectoryError: naming the folder that has its name
+    :raises NotADirectoryError: as :func:`check_folder`, about the folder that it is for
+    """
+    if os.path.isdir(path):
+        raise IsADirectoryError(f"{argument} must be the path of a file, got {os.fspath(path)!r}: that is a folder.")
+    check_folder(f"the folder of {argument}", Path(path).parent)

@@ -12,7 +12,7 @@ from sb3_dreamer_urlb.analysis.study_settings import remember
 from sb3_dreamer_urlb.analysis.trajectories import save_trajectories
 from sb3_dreamer_urlb.cli.methods_tour import TourConfig, run_tour
 from sb3_dreamer_urlb.evaluation.append import append_rows
-from sb3_dreamer_urlb.folders import check_folder, made_folder
+from sb3_dreamer_urlb.folders import check_file, check_folder, made_folder
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
 
 
@@ -60,3 +60,10 @@ def test_folders_are_made_where_they_are_missing(tmp_path):
     assert not path.parent.exists()
     for _ in range(2):
         assert made_folder("folder", str(path)) == path and path.is_dir()
+
+
+def test_a_folder_where_a_file_is_wanted(tmp_path):
+    with pytest.raises(IsADirectoryError, match=f"^--out must be the path of a file, got '{tmp_path}': that is a folder"):
+        check_file("--out", tmp_path)
+    check_file("--out", tmp_path / "a" / "b.html")
+    assert not list(tmp_path.iterdir())

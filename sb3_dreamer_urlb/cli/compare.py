@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.folders import made_folder
+from sb3_dreamer_urlb.folders import check_file, made_folder
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.tables import Table
@@ -44,6 +44,7 @@ def run(options: dict[str, Any]) -> int:
         groups.setdefault(label if equals else paths[0].resolve().name, []).extend(paths)
     if options["out"].suffix.lower() in (".png", ".pdf"):
         raise ValueError(f"--out {options['out']} is the page, compare.html say; its picture comes beside it under that name.")
+    check_file("--out", options["out"])
     table, written = compare_runs(groups, options["out"], options.get("tag"))
     print(f"{table.text()}\nWrote {', '.join(map(str, written))}.")
     return 0

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.folders import check_file
+
 HELP = "write one HTML page about a run"
 
 
@@ -43,6 +45,8 @@ def write_report(folder: Path, out: Path | None = None, rows: list[Path] | None 
     from sb3_dreamer_urlb.evaluation.run_page import run_page
     from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
+    if out is not None:
+        check_file("--out", out)
     out = out or folder / "report.html"
     page = run_page(read_run(folder, rows), command)
     with written_atomically(out) as file:

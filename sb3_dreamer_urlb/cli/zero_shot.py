@@ -13,7 +13,7 @@ from sb3_dreamer_urlb.cli.agents import (
     environments_at_a_time,
     load_agent,
 )
-from sb3_dreamer_urlb.folders import made_folder
+from sb3_dreamer_urlb.folders import check_file
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
@@ -64,9 +64,7 @@ def run(options: dict[str, Any]) -> int:
     if "rows" in options:
         check_can_append(options["rows"])
     if "save" in options:
-        made_folder("the folder of --save", options["save"].parent)
-        if options["save"].is_dir():
-            raise ValueError(f"--save {options['save']} is a folder: give a file.")
+        check_file("--save", options["save"])
     first, env = load_agent(options, envs)
     env.close()
     check_pretrained(first)

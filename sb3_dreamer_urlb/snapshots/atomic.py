@@ -27,7 +27,7 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     path = Path(path)
     check_folder("the folder of a file", path.parent)
     # The process's number keeps two writers apart; a leftover of a killed process of the same number is overwritten.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
+    temporary = path.parent / f".{path.name}.{os.getpid()}{TEMPORARY}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
