@@ -28,6 +28,7 @@ from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.envs.normalized import RewardsOnly, hides_originals, original_end, original_observations
 from sb3_dreamer_urlb.envs.touches import last_touches
 from sb3_dreamer_urlb.spaces.actions import make_actions
+from sb3_dreamer_urlb.spaces.observation_checks import check_classes
 
 
 class CollectingAlgorithm(SavingAlgorithm):
@@ -196,6 +197,8 @@ class CollectingAlgorithm(SavingAlgorithm):
         for i in np.flatnonzero(dones):
             _put(next_obs, int(i), self._last_of_episode(int(i), infos[i]))
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
+        for seen in (next_obs, new_obs):
+            self._check_classes(seen, "step")
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
         # Environments may write the next observation into the same arrays.
@@ -243,9 +246,15 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._touches = last_touches(self.env)
         # Environments may write the next observation into the same arrays.
         self._last_obs = copy.deepcopy(self._last_obs)
+        self._check_classes(self._last_obs, "reset")
         self._leave_standing()
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._last_obs)
+
+    def _check_classes(self, seen: Any, asked: str) -> None:
+        """Before anything out of its space is acted on or kept; ``asked`` is what the environments did."""
+        with asking_to(asked):
+            check_classes("The environments' observation", seen, self.observation_space)
 
     def _leave_standing(self) -> None:
         assert self.env is not None and self._last_episode_starts is not None

@@ -200,7 +200,8 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
             raise ValueError(f"state must be what the last predict() returned, a tuple of {len(shapes)} arrays, got {got}.")
         found = [np.shape(part) for part in state]
         if any(len(shape) == 0 or shape[0] != n for shape in found):
-            raise ValueError(f"state is for {[(*shape, 0)[0] for shape in found]} environments, the observation for {n}.")
+            whose = " or ".join(map(str, dict.fromkeys((*shape, 0)[0] for shape in found)))
+            raise ValueError(f"state is for {whose} environments, the observation for {n}.")
         expected = [its[1:] if shape is None else shape for its, shape in zip(found, shapes, strict=True)]
         if [its[1:] for its in found] != expected:
             raise ValueError(

@@ -51,15 +51,25 @@ def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, got {_numbers(array)}.")
-    _check_classes(name, array, space)
+    check_classes(name, array, space)
     # Views with negative strides (a mirrored image) are arrays that torch does not take.
     return np.ascontiguousarray(array).reshape(array.shape)
 
 
-def _check_classes(name: str, array: np.ndarray, space: spaces.Space[Any]) -> None:
-    """:raises ValueError: for numbers that are none of the space's classes, which torch would only say is out of bounds"""
+def check_classes(name: str, observation: Any, space: spaces.Space[Any]) -> None:
+    """Whether choices are among those of their space: torch would only say that an index is out of bounds.
+
+    :param name: of the observation, which begins the message
+    :param observation: array of one environment or with a leading n; or several by name
+    :param space: of one environment
+    :raises ValueError: naming the numbers and the space
+    """
+    if isinstance(space, spaces.Dict):
+        for part in set(space.keys()) & set(observation):
+            check_classes(f"{name} {part!r}", observation[part], space[part])
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return
+    array = np.asarray(observation)
     least, count = (space.start, space.n) if isinstance(space, spaces.Discrete) else (space.start, space.nvec)
     wrong_shape = array.ndim < len(space.shape or ()) or (space.shape and array.shape[-len(space.shape) :] != space.shape)
     if not wrong_shape and not ((array >= least) & (array < least + count)).all():

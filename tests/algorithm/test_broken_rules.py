@@ -81,6 +81,46 @@ def test_an_error_says_what_finds_the_breach(env, given, capsys):
     assert error.count("\n") == 1 and "check_env(env)" in error
 
 
+CHOICES = {
+    "Discrete": (spaces.Discrete(4), 7, "7"),
+    "Discrete, from 1": (spaces.Discrete(4, start=1), 0, "0"),
+    "MultiDiscrete": (spaces.MultiDiscrete([2, 3]), np.array([1, -1]), r"1, -1"),
+}
+
+
+class LeavesItsSpace(Kept):
+    """With its observation of a number, counted from 0; the last of an episode is number 3."""
+
+    def __init__(self, space, wrong, when, named):
+        self.observation_space = spaces.Dict({"arm": BOX, "way": space}) if named else space
+        self.wrong, self.when, self.named, self.count = wrong, when, named, -1
+
+    def seen(self):
+        self.count += 1
+        seen = super().seen()
+        if self.count == self.when:
+            return {**seen, "way": self.wrong} if self.named else self.wrong
+        return seen
+
+    def step(self, action):
+        ends = (self.count + 1) % 4 == 3
+        return self.seen(), 0.0, ends, False, {}
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["alone", "by name"])
+@pytest.mark.parametrize("when", [0, 2, 3, 4], ids=["first", "within an episode", "last", "first of the next"])
+@pytest.mark.parametrize("choices", CHOICES)
+def test_choices_out_of_their_space_are_refused_before_they_are_kept(choices, when, named):
+    space, wrong, shown = CHOICES[choices]
+    env = LeavesItsSpace(space, wrong, when, named)
+    model = DreamerV2("MultiInputPolicy" if named else "MlpPolicy", env, preset="tiny", device="cpu", learning_starts=100)
+    whose = "observation 'way'" if named else "observation"
+    with pytest.raises(ValueError, match=rf"^The environments' {whose} must be in {type(space).__name__}.*{shown}") as raised:
+        model.learn(8)
+    (note,) = raised.value.__notes__
+    assert f"asked to {'step' if when else 'reset'}." in note and "check_env(env) tells" in note
+
+
 def test_other_errors_are_left_alone():
     def fails(*_):
         raise ValueError("of a callback")
