@@ -13,6 +13,9 @@ def is_a_mistake(error: Exception) -> bool:
     # Pipes to processes of our own: nobody asked for anything wrong.
     if isinstance(error, ConnectionError):
         return False
+    # An argument for an environment that it does not have, as Gymnasium tells it.
+    if isinstance(error, TypeError) and all(part in str(error) for part in ("unexpected keyword", "environment creator")):
+        return True
     # Only what is loaded can have raised: a command that needs no environment does not wait for Gymnasium.
     gymnasium = sys.modules.get("gymnasium")
     return isinstance(error, ValueError | ImportError | OSError) or (

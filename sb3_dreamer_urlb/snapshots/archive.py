@@ -246,6 +246,8 @@ class Archive:
 
 #: what reads each kind of file
 READERS = {"model": "an algorithm's load", "policy": "a policy's load", "replay": "load_replay_buffer"}
+#: of every protocol since Python 3
+PICKLE_BEGINS = b"\x80"
 PICKLE = (
     "it is a pickle, as Stable-Baselines3 writes them, and loading it could run any code. If you trust where it comes "
     "from, convert it: sb3-dreamer-urlb convert OLD NEW --trust"
@@ -301,7 +303,7 @@ def _check_directory(file: BinaryIO) -> None:
     file.seek(max(0, size - 98))
     tail = file.read(98)
     file.seek(0)
-    if file.read(2)[:1] == b"\x80":
+    if file.read(2)[:1] == PICKLE_BEGINS:
         raise ValueError(PICKLE)
     end = tail[-22:]
     if len(end) < 22 or end[:4] != b"PK\x05\x06" or end[20:] != b"\0\0":

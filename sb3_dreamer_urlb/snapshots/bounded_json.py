@@ -20,8 +20,12 @@ def parse(content: bytes) -> Any:
     :raises ValueError: saying which bound it breaks
     """
     try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError("it is no text, where JSON was expected") from None
+    try:
         value = json.loads(
-            content.decode("utf-8"),
+            text,
             object_pairs_hook=_unique,
             parse_constant=_no_constant,
             parse_float=_finite,

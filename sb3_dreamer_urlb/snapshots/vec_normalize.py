@@ -12,12 +12,16 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dreamer_urlb.number_checks import is_finite_number
 from sb3_dreamer_urlb.snapshots import bounded_json, normalization
-from sb3_dreamer_urlb.snapshots.archive import blaming
+from sb3_dreamer_urlb.snapshots.archive import PICKLE_BEGINS, blaming
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
 FIELDS = {*NUMBERS, "norm_obs", "norm_reward", "norm_obs_keys", "statistics"}
 MAX_BYTES = 8 << 20
+PICKLE = (
+    "it is a pickle, as VecNormalize.save writes them, and loading it could run any code. If you trust where it comes from: "
+    "save_vec_normalize(VecNormalize.load(OLD, venv), NEW) of sb3_dreamer_urlb.hub"
+)
 #: ending of the file of statistics that belongs to the snapshot of the same name
 BESIDE = ".vec_normalize.json"
 
@@ -59,7 +63,10 @@ def load_vec_normalize(path: str | os.PathLike[str], venv: VecEnv, training: boo
         size = Path(path).stat().st_size
         if size > MAX_BYTES:
             raise ValueError(f"it has {size} bytes")
-        data = bounded_json.parse(Path(path).read_bytes())
+        content = Path(path).read_bytes()
+        if content.startswith(PICKLE_BEGINS):
+            raise ValueError(PICKLE)
+        data = bounded_json.parse(content)
         if not isinstance(data, dict) or set(data) != FIELDS:
             raise ValueError("it has other fields than it should")
         settings = {name: _number(name, data[name]) for name in NUMBERS}

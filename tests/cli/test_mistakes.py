@@ -56,6 +56,15 @@ def test_a_mistake_costs_a_line(door, error, capsys):
     assert capsys.readouterr().err == "program: a b\n"
 
 
+@DOORS
+def test_an_argument_that_an_environment_does_not_have_costs_a_line(door, capsys):
+    with pytest.raises(TypeError) as raised:
+        gymnasium.make("CartPole-v1", foo=1)
+    assert door(raised.value) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "unexpected keyword argument 'foo'" in error and "CartPole-v1" in error
+
+
 @pytest.mark.parametrize("door", [own_commands, zoo_commands_uncaught])
 @pytest.mark.parametrize(
     "error", [TypeError("a"), KeyError("a"), BrokenPipeError("a"), ConnectionResetError("a"), SystemExit(3)]
@@ -76,6 +85,11 @@ def test_an_interruption_costs_a_line(args, line, capsys):
     [
         ("figures {folder} --out {folder}/out", "Is a directory"),
         ("report {file}", "is no folder of a run"),
+        ("report {folder} --out {folder}", "--out must be the path of a file, got '{folder}': that is a folder"),
+        ("report {folder} --out .", "--out must be the path of a file, got '.': that is a folder"),
+        ("report {folder} --out {file}/x.html", "the folder of --out must be the path of a folder"),
+        ("compare {folder} --out {folder}", "--out must be the path of a file"),
+        ("zero-shot x.zip --env CartPole-v1 --finetune-frames 8 --save {folder}", "--save must be the path of a file"),
         ("compare A= --out {folder}/page.html", "'A=': expected the folder of a run"),
         ("compare {folder}, --out {folder}/page.html", "expected the folder of a run"),
         ("compare {folder} --out {folder}/page.png", "is the page"),
@@ -93,5 +107,5 @@ def test_commands_in_a_line(command, said, tmp_path, capsys):
     (tmp_path / "file").write_text("x")
     assert main(command.format(folder=tmp_path, file=tmp_path / "file").split()) == 2
     error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
+    assert said.format(folder=tmp_path) in error and error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
