@@ -6,6 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable
+from itertools import pairwise
 
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
@@ -14,7 +15,8 @@ from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 
 #: hours that a ``learn`` on a CPU may still take without a word
 LONG = 24.0
-#: rollouts with updates whose pace is taken, after the first, in which kernels are compiled
+#: rollouts with updates of which the fastest sets the pace, after the first, in which kernels are compiled: callbacks may
+#: evaluate or save in the others
 PACED = 4
 
 
@@ -56,7 +58,8 @@ class UpdatesDue:
             times.append(time.monotonic())
             steps.append(model.num_timesteps)
             if len(times) > PACED:
-                self._tell_if_long((times[-1] - times[0]) / max(steps[-1] - steps[0], 1))
+                between = zip(pairwise(times), pairwise(steps), strict=True)
+                self._tell_if_long(min((end - begin) / max(last - first, 1) for (begin, end), (first, last) in between))
 
         return updating
 

@@ -108,3 +108,12 @@ def test_days_on_a_cpu_are_told_once(tiny_model, monkeypatch, hours, told_of):
     if told_of:
         left = int(re.search(r"for (\d+) agent steps, on a CPU", long[0])[1])
         assert 940 < left < 1000 and f"another {hours * left / 1000:.0f} hours" in long[0] and "than 'tiny'" in long[0]
+
+
+def test_what_callbacks_do_in_between_is_no_pace(tiny_model, monkeypatch):
+    model = tiny_model(CounterEnv(5), learning_starts=10, train_freq=2)
+    long_evaluations = iter([0.0, 1e6, 2e6, 2e6 + 1, 3e6])
+    monkeypatch.setattr(updates_due, "time", SimpleNamespace(monotonic=lambda: next(long_evaluations)))
+    with told_meanwhile() as told_now:
+        model.learn(1000, StopsAt(60))
+    assert not [text for text in told_now if "hours" in text]
