@@ -33,8 +33,11 @@ def choose(precision: str, part: str, device: th.device | str, feature_size: int
     if precision == "auto":
         fast = on_cpu and _cpu_has_short_products() and cpu_multiplies_short() and feature_size >= AUTO_FEATURE_SIZE[part]
         return th.bfloat16 if fast else th.float32
-    if precision == "bfloat16" and on_cpu and not cpu_multiplies_short():
-        _warn_of_slow_products()
+    if precision == "bfloat16" and on_cpu:
+        if not cpu_multiplies_short():
+            _warn_of_slow_products("about a hundred times")
+        elif _cpu_widens_first():
+            _warn_of_slow_products("two to three times")
     return {"float32": th.float32, "bfloat16": th.bfloat16}[precision]
 
 
@@ -70,7 +73,7 @@ def multiply(left: th.Tensor, right: th.Tensor) -> th.Tensor:
 
 @functools.cache
 def cpu_multiplies_short() -> bool:
-    """Whether torch multiplies bfloat16 numbers with instructions that this processor has for them.
+    """Whether torch multiplies bfloat16 numbers at all well: with instructions for them, or widened, with AVX-512's.
 
     Whoever multiplies is asked, oneDNN: it knows what the processor can, and what ``ONEDNN_MAX_CPU_ISA`` hides. Elsewhere
     torch has loops of its own, at a hundredth of the speed of float32.
@@ -85,15 +88,23 @@ def cpu_multiplies_short() -> bool:
 
 
 @functools.cache
-def _warn_of_slow_products() -> None:
+def _warn_of_slow_products(how_long: str) -> None:
     warnings.warn(
-        'precision="bfloat16" is slow here: this processor has no instructions for bfloat16 products, which take about a '
-        'hundred times as long as float32 ones; precision="auto" takes whichever is faster'
+        'precision="bfloat16" is slow here: this processor has no instructions for bfloat16 products, which take '
+        f'{how_long} as long as float32 ones; precision="auto" takes whichever is faster'
     )
 
 
 def _cpu_has_short_products() -> bool:
-    # oneDNN alone would not do: with AVX-512 it takes bfloat16 also where it has to turn every number into float32 first.
+    return _is_any_supported("amx_tile", "avx512_bf16")
+
+
+def _cpu_widens_first() -> bool:
+    """Whether torch takes bfloat16, with AVX-512, but has to turn every number into float32 before it multiplies."""
+    return _is_any_supported("avx512") and not _cpu_has_short_products()
+
+
+def _is_any_supported(*features: str) -> bool:
     # Private in every torch so far; without them nothing is known about the CPU.
-    probes = (getattr(th.cpu, name, None) for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported"))
+    probes = (getattr(th.cpu, f"_is_{feature}_supported", None) for feature in features)
     return any(probe is not None and probe() for probe in probes)

@@ -65,6 +65,20 @@ def test_asking_for_it_warns_once_and_on_a_gpu_not_at_all(slow_at_bfloat16):
     assert len(said) == 1 and "slow here" in said[0]
 
 
+@pytest.mark.parametrize("widens", [True, False])
+def test_avx512_without_products_of_it_warns_too(monkeypatch, widens):
+    for name, has in (("amx_tile", False), ("avx512_bf16", not widens), ("avx512", True)):
+        monkeypatch.setattr(th.cpu, f"_is_{name}_supported", lambda has=has: has)
+    monkeypatch.setattr(precision, "cpu_multiplies_short", lambda: True)
+    precision._warn_of_slow_products.cache_clear()
+    with told_meanwhile() as said:
+        for part in ("update", "planner"):
+            assert precision.choose("bfloat16", part, "cpu", 8) == th.bfloat16
+    precision._warn_of_slow_products.cache_clear()
+    assert len(said) == widens and all("two to three times as long as float32" in text for text in said)
+    assert precision.choose("auto", "update", "cpu", 10**6) == (th.float32 if widens else th.bfloat16)
+
+
 def test_planners_products_are_rounded_alike_whoever_multiplies(slow_at_bfloat16, seeded):
     weight, bias, plus, x = th.randn(30, 40), th.randn(30), th.randn(7, 30).bfloat16(), th.randn(7, 40).bfloat16()
     layer = PrepackedLinear(weight, bias, th.bfloat16)
