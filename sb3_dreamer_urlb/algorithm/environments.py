@@ -16,7 +16,6 @@ from sb3_dreamer_urlb.algorithm.environment_checks import check_env
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.normalized import watch_ends
 from sb3_dreamer_urlb.envs.touches import last_touches
-from sb3_dreamer_urlb.snapshots import normalization
 
 
 class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
@@ -60,7 +59,7 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
         :param force_reset: reset it before going on; False does not if it stands where the model left it, wrapped as then
         :raises ValueError: if it does not fit; the model stays as it is
         """
-        wrapped, known = self.prepare_env(env), self._known_statistics()
+        wrapped, known = self.prepare_env(env), self.known_statistics()
         self._sets_env = True
         try:
             super().set_env(wrapped, force_reset)
@@ -71,10 +70,6 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
             self._last_obs = None
         self._read_env()
         self._go_on_normalized(known)
-
-    def _known_statistics(self) -> Mapping[str, th.Tensor]:
-        """Of the VecNormalize that the model has learnt behind."""
-        return self.loaded_statistics if self.env is None else normalization.pack(self._vec_normalize_env)
 
     def _go_on_normalized(self, known: Mapping[str, th.Tensor]) -> None:
         if max(self.phase_timesteps, self.num_timesteps) > 0:

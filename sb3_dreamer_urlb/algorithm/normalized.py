@@ -56,7 +56,7 @@ def go_on(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
     :param known: all statistics of the VecNormalize that it learnt behind, empty without
     :param after: of the environment, None without; changed in place
     """
-    known = normalization.of_observations(known)
+    whole, known = known, normalization.of_observations(known)
     its = normalization.of_observations(normalization.pack(after))
     if after is None or not its:
         if known:
@@ -65,6 +65,11 @@ def go_on(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
                 "would see other numbers for the same state. Wrap it in VecNormalize, which takes the statistics over."
             )
         return
+    if known and (texts := normalization.differing(whole, after, normalization.OF_OBSERVATIONS)):
+        warnings.warn(
+            f"The model has learnt from observations through VecNormalize({texts[0]}), this environment has "
+            f"VecNormalize({texts[1]}): it would see other numbers for the same state."
+        )
     if not _has_seen_nothing(after):
         return
     if {name: value.shape for name, value in known.items()} == {name: value.shape for name, value in its.items()}:

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_dreamer_urlb.algorithm.checks import given_env
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
-from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row
+from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row, check_can_append
 from sb3_dreamer_urlb.evaluation.episodes import (
     AUTO,
     EPISODES,
@@ -122,6 +122,8 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
         for name, folder in (("best_model_save_path", self.best_model_save_path), ("log_path", logs)):
             if folder:
                 made_folder(name, folder)
+        if self.rows is not None:
+            check_can_append(self.rows)
         if self.callback_on_new_best is not None:
             self.callback_on_new_best.init_callback(self.model)
         if self.rows is not None and self.model.seed is None and "seed" not in self.columns:

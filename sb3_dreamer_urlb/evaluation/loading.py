@@ -28,8 +28,9 @@ def normalized_as_saved(env: VecEnv, snapshot: Path) -> VecEnv:
         return env
     seen = any(name.startswith(f"{normalization.PREFIX}{normalization.OBSERVATION}") for name in stored)
     keys = sorted({name.split("/", 1)[1].rsplit(".", 1)[0] for name in stored if "/" in name}) or None
-    wrapped = VecNormalize(env, training=False, norm_obs=seen, norm_reward=False, norm_obs_keys=keys)
     with blaming(str(snapshot)):
+        its = {**normalization.stored_settings(stored), "norm_reward": False}
+        wrapped = VecNormalize(env, training=False, norm_obs=seen, norm_obs_keys=keys, **its)  # type: ignore[arg-type]
         normalization.restore(wrapped, stored)
     return wrapped
 

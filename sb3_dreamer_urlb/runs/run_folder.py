@@ -207,7 +207,13 @@ class RunFolder:
             warnings.warn(f"{self.snapshot} holds no statistics of VecNormalize: they begin anew.")
         if normalizer is not None and self.statistics:
             with blaming(str(self.snapshot)):
+                texts = normalization.differing(self.statistics, normalizer)
                 normalization.restore(normalizer, self.statistics)
+            if texts:
+                raise ValueError(
+                    f"The run in {self.path} normalises with VecNormalize({texts[0]}), its environment is wrapped in "
+                    f"VecNormalize({texts[1]}) now: a run keeps its arguments."
+                )
             training, normalizer.training = normalizer.training, False
             restart()
             normalizer.training = training

@@ -46,7 +46,7 @@ def save(
     :raises OSError: naming the path; the old file stays
     """
     model.take_over_changes()
-    statistics = normalization.pack(model.get_vec_normalize_env()) if model.env is not None else model.loaded_statistics
+    statistics = model.known_statistics()
     mine, data = _all_tensors(model), describe(model, run)
     data["arguments"].update(values.encode(dict(instead or {})))
     content = tensors.pack({**mine, **statistics})

@@ -1,11 +1,12 @@
-"""VecNormalize's running statistics ↔ tensors of a model's file; SB3's own file of them is a pickle.
+"""VecNormalize's running statistics and settings ↔ tensors of a model's file; SB3's own file of them is a pickle.
 
-The statistics are the file's, everything else of a VecNormalize (what it normalises, its bounds) is the script's.
+The statistics are the file's; the settings are there to be compared with those of a script, or where no script has any.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 
 import torch as th
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -16,6 +17,11 @@ from sb3_dreamer_urlb.snapshots.tensors import Table
 #: what the names of these tensors begin with, beside the model's own
 PREFIX = "normalization."
 RETURN, OBSERVATION = "return", "observation"
+#: tensor of the settings, float64, in this order; files of before 0.2 lack it
+SETTINGS = f"{PREFIX}settings"
+SETTING_NAMES = ("clip_obs", "epsilon", "clip_reward", "gamma", "norm_reward")
+#: those that change what an agent sees
+OF_OBSERVATIONS = SETTING_NAMES[:2]
 
 
 def statistics(normalizer: VecNormalize) -> dict[str, RunningMeanStd]:
@@ -46,6 +52,53 @@ def pack(normalizer: VecNormalize | None) -> dict[str, th.Tensor]:
     }
 
 
+def settings(normalizer: VecNormalize) -> dict[str, float]:
+    """By name, as a file holds them: numbers, in place of infinite ones the greatest.
+
+    :param normalizer: whose
+    """
+    return {name: min(float(getattr(normalizer, name)), sys.float_info.max) for name in SETTING_NAMES}
+
+
+def pack_whole(normalizer: VecNormalize | None) -> dict[str, th.Tensor]:
+    """Statistics, as :func:`pack` gives them, and settings.
+
+    :param normalizer: None without one
+    """
+    if normalizer is None:
+        return {}
+    return {**pack(normalizer), SETTINGS: th.tensor([*settings(normalizer).values()], dtype=th.float64)}
+
+
+def stored_settings(stored: Mapping[str, th.Tensor]) -> dict[str, float]:
+    """Those that a file holds, by name; none in older ones.
+
+    :param stored: what :func:`pack_whole` gave
+    :raises ValueError: if they are none
+    """
+    if SETTINGS not in stored:
+        return {}
+    values = stored[SETTINGS]
+    if values.dtype != th.float64 or values.shape != (len(SETTING_NAMES),) or not bool((values >= 0).all()):
+        raise ValueError(f"the settings of its VecNormalize are {values.dtype} {list(values.shape)}")
+    return dict(zip(SETTING_NAMES, values.tolist(), strict=True))
+
+
+def differing(
+    stored: Mapping[str, th.Tensor], normalizer: VecNormalize, names: Sequence[str] = SETTING_NAMES
+) -> tuple[str, str] | None:
+    """The settings in which a file's VecNormalize and another differ, as texts for a sentence; None where they agree.
+
+    :param stored: what :func:`pack_whole` gave
+    :param normalizer: the other
+    :param names: of the settings that count
+    """
+    theirs, mine = stored_settings(stored), settings(normalizer)
+    wrong = [name for name in names if name in theirs and theirs[name] != mine[name]]
+    texts = [", ".join(f"{name}={one[name]:g}" for name in wrong) for one in (theirs, mine)]
+    return (texts[0], texts[1]) if wrong else None
+
+
 def of_observations(stored: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
     """Those of what an agent sees.
 
@@ -68,6 +121,7 @@ def restore(normalizer: VecNormalize, stored: dict[str, th.Tensor]) -> None:
     :raises ValueError: if they are of something else, or no statistics
     """
     expected = pack(normalizer)
+    stored = {name: value for name, value in stored.items() if name != SETTINGS}
     if expected.keys() != stored.keys():
         raise ValueError(
             f"its VecNormalize had the statistics {sorted(stored)}, that of the environment has {sorted(expected)}"

@@ -18,6 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
+from sb3_dreamer_urlb.snapshots import normalization
 
 #: constructor arguments that are the loader's business
 NOT_STORED = {"self", "policy", "env", "device", "_init_setup_model"}
@@ -61,6 +62,10 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     kept: dict[str, bool] | None
     #: of the VecNormalize that it learnt behind, as a file had them; empty without
     loaded_statistics: Mapping[str, th.Tensor] = MappingProxyType({})
+
+    def known_statistics(self) -> Mapping[str, th.Tensor]:
+        """Statistics and settings of the VecNormalize that the model has learnt behind."""
+        return self.loaded_statistics if self.env is None else normalization.pack_whole(self._vec_normalize_env)
 
     @abstractmethod
     def _prepare(self) -> None:
