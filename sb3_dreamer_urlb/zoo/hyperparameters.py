@@ -27,6 +27,8 @@ OWN_KEYS = (
 WHOLE_NUMBERS = {"n_envs", "frame_stack"}
 #: those that name classes, and what these are given without being asked
 CLASSES = {"callback": (), "env_wrapper": ("env",), "vec_env_wrapper": ("venv",)}
+#: arguments that rl_zoo3 hands over itself, and the options that say them
+OF_THE_COMMAND_LINE = {"env", "seed", "device", "verbose", "tensorboard_log"}
 #: keys whose values are nobody's to judge
 OF_THE_ENVIRONMENT = "env_kwargs"
 #: a number for everybody but YAML, which wants a point and a sign in it
@@ -45,6 +47,12 @@ def check(hyperparams: dict[str, Any], algorithm: str, arguments: Iterable[str])
         if name not in known:
             meant = did_you_mean([name], known)
             raise ValueError(f"Unknown hyperparameter {name!r}, neither of rl_zoo3's nor of {algorithm}'s.{meant}")
+    for name in sorted(OF_THE_COMMAND_LINE & set(hyperparams)):
+        raise ValueError(f"{name} is no hyperparameter: give --{name.replace('_', '-')} on the command line.")
+    if not isinstance(kwargs := hyperparams.get(OF_THE_ENVIRONMENT) or {}, dict | str):
+        raise ValueError(f"{OF_THE_ENVIRONMENT} must be arguments of the environment by name, got {kwargs!r}.")
+    if hyperparams.get("noise_type") is not None and "noise_std" not in hyperparams:
+        raise ValueError(f"noise_type {hyperparams['noise_type']!r} needs noise_std, the noise's standard deviation.")
     for path, text in _texts({name: value for name, value in hyperparams.items() if name != OF_THE_ENVIRONMENT}):
         if EXPONENT.fullmatch(text):
             raise ValueError(f"{path}: YAML reads {text} as text, not as a number: write {_for_yaml(text)}.")

@@ -21,6 +21,8 @@ from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 
 #: what Python says of arguments that a function does not have, or lacks
 SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
+#: options of rl_zoo3's that count what there must be one of
+COUNTS = {"n_envs", "n_eval_envs", "eval_episodes"}
 #: folders that this process has made for a run, each with those around it that it has made, too, from within
 NEW_FOLDERS: list[list[Path]] = []
 
@@ -30,7 +32,8 @@ def told_in_a_line(prog: str) -> Iterator[None]:
     """Mistakes in options, configurations and environments end the program with a line, as long as no agent has acted.
 
     The folders that were made for a run which does not begin go with it: ``enjoy`` would take one for the newest run.
-    Once a run collects or a trained agent plays, whatever is raised is not about arguments, and goes on upwards.
+    They go, too, where another error ends it then. Once a run collects or a trained agent plays, whatever is raised is not
+    about arguments, and goes on upwards.
 
     :param prog: name of the command
     :raises SystemExit: 2, in place of such an error
@@ -46,10 +49,12 @@ def told_in_a_line(prog: str) -> Iterator[None]:
         try:
             yield
         except Exception as error:
-            if begun or not (is_a_mistake(error) or _is_of_a_configuration(error)):
+            if begun:
                 raise
             for folder, *around in NEW_FOLDERS:
                 _take_back(folder, around)
+            if not (is_a_mistake(error) or _is_of_a_configuration(error)):
+                raise
             tell(prog, error)
             raise SystemExit(2) from error
 
@@ -98,6 +103,8 @@ def _noted(original: Callable[..., Any], calls: list[bool]) -> Callable[..., Any
 def _is_of_a_configuration(error: Exception) -> bool:
     if isinstance(error, AttributeError):  # a class named there that its module does not have
         return isinstance(error.obj, ModuleType)
+    if isinstance(error, AssertionError):  # as rl_zoo3 checks a few of its options
+        return bool(str(error))
     by_python = isinstance(error, TypeError) and any(phrase in str(error) for phrase in SIGNATURE)
     return by_python or isinstance(error, yaml.YAMLError)
 
@@ -111,12 +118,16 @@ def with_values_named(parse: Callable[..., argparse.Namespace]) -> Callable[...,
     @functools.wraps(parse)
     def parse_args(parser: argparse.ArgumentParser, *args: Any, **kwargs: Any) -> argparse.Namespace:
         try:
-            return parse(parser, *args, **kwargs)
+            options = parse(parser, *args, **kwargs)
         except Exception as error:
             parser.error(
                 f"{type(error).__name__}: {error}. Values of -params and of environments' arguments are Python, in which text "
                 "has quotation marks: \"preset:'tiny'\""
             )
+        for name in COUNTS & vars(options).keys():
+            if (count := getattr(options, name)) < 1:
+                parser.error(f"--{name.replace('_', '-')} must be at least 1, got {count}.")
+        return options
 
     return parse_args
 

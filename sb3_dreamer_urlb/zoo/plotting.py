@@ -8,9 +8,11 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from sb3_dreamer_urlb.folders import check_file, made_folder
 from sb3_dreamer_urlb.words import counted
 from sb3_dreamer_urlb.zoo.found_runs import check_there_are_runs
 from sb3_dreamer_urlb.zoo.mistakes import told_in_a_line
@@ -35,6 +37,7 @@ def plot(arguments: list[str], prog: str) -> int:
 
     sys.argv = [prog, *rest]
     if own.output:
+        made_folder("the folder of --output", Path(own.output).parent)
         plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
     with told_in_a_line(prog), _counted(sys.modules[plot_train.__module__]) as counts, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "No artists with labels")  # told below, run by run
@@ -70,6 +73,13 @@ def _understood(arguments: list[str], prog: str) -> tuple[argparse.Namespace, li
     for option, given in (("--algo", own.algo), ("--exp-folder", own.exp_folder), ("--env", envs)):
         if given:
             rest += [option, *([given] if isinstance(given, str) else given)]
+    if own.episode_window < 1:
+        parser.error(f"--episode-window must be at least 1, got {own.episode_window}.")
+    if own.output:
+        try:
+            check_file("--output", own.output)
+        except OSError as error:
+            parser.error(str(error))
     if not {"-h", "--help"} & set(rest):
         if not own.output and not has_display():
             parser.error("no display to show the curves on: write them into a file with --output")

@@ -349,6 +349,10 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
             f"callback:'{SWITCH[:-2]}'",
             "callback: sb3_dreamer_urlb has no 'PhaseSwitchCallba'. Did you mean 'PhaseSwitchCallback'",
         ),
+        ("seed:5", "seed is no hyperparameter: give --seed on the command line."),
+        ("tensorboard_log:'tb'", "tensorboard_log is no hyperparameter: give --tensorboard-log"),
+        ("env_kwargs:3", "env_kwargs must be arguments of the environment by name, got 3."),
+        ("noise_type:'normal'", "noise_type 'normal' needs noise_std"),
         ("callback:3", "callback: expected module.Class, got 3."),
         ("env_wrapper:[4.5]", "env_wrapper: expected module.Class, got 4.5."),
         ("callback:'PhaseSwitchCallback'", f"expected module.Class, got 'PhaseSwitchCallback'. Did you mean '{SWITCH}'"),
@@ -410,6 +414,42 @@ def test_a_start_that_is_refused_leaves_no_folder(zoo, capsys, there):
     assert "FineTuneCallback needs a pre-trained model" in line
     left = {path for folder in folders for path in (folder, folder.parent)}
     assert set(Path().rglob("*")) == left
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--eval-freq", "8", "--eval-episodes", "0"), "--eval-episodes must be at least 1, got 0."),
+        (("--eval-freq", "8", "--n-eval-envs", "0"), "--n-eval-envs must be at least 1, got 0."),
+        (("-i", "own.yml"), "valid path to a .zip file"),
+    ],
+)
+def test_options_that_rl_zoo3_does_not_check_are_refused(zoo, capsys, options, message):
+    Path("own.yml").write_text("")
+    with pytest.raises(SystemExit, match=r"^2$"):
+        train(zoo, STAND, 8, "lbs", *options, params=TINY)
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not Path("logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("-w", "0", "--output", "a.png"), "--episode-window must be at least 1, got 0."),
+        (("--output", "."), "--output must be the path of a file, got '.': that is a folder."),
+    ],
+)
+def test_options_of_plot_are_looked_at_before_anything_is_drawn(zoo, capsys, options, message):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        zoo("plot", "-a", "dreamerv2", "-e", STAND, "-f", "logs", *options)
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_error_of_another_kind_leaves_no_folder_either(tmp_path):
+    with pytest.raises(KeyError), mistakes.told_in_a_line("zoo"):
+        utils.configure_logger(0, str(tmp_path / "tb"), "run", True)
+        raise KeyError
+    assert not (tmp_path / "tb").exists()
 
 
 def test_a_log_that_goes_on_is_not_taken_back(tmp_path):
