@@ -13,6 +13,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_dreamer_urlb.dreamer_v2.policies import DreamerPolicy
+from sb3_dreamer_urlb.folders import check_file, made_folder
 from sb3_dreamer_urlb.spaces.observations import DictObservations
 from sb3_dreamer_urlb.types import LatentState, Observation
 from sb3_dreamer_urlb.version import how_to_install
@@ -197,15 +199,23 @@ def to_torchscript(step: ActingStep, path: str | os.PathLike[str]) -> None:
     """Write a step for ``torch.jit.load``, in Python or C++.
 
     :param step: what to write
-    :param path: of the file, taken as it is
+    :param path: of the file, taken as it is; missing folders are made
     :raises ValueError: for anything else
+    :raises OSError: if a folder has its name
     """
     _check_step(step)
+    path = _file_to_write(path)
     with th.no_grad(), warnings.catch_warnings():
         # Branches on sizes choose the fastest of equal ways; and torch says that it will one day write another format.
         warnings.simplefilter("ignore", th.jit.TracerWarning)  # type: ignore[attr-defined]
         warnings.simplefilter("ignore", DeprecationWarning)
-        th.jit.trace(step, step.example(), check_trace=False).save(os.fspath(path))
+        th.jit.trace(step, step.example(), check_trace=False).save(path)
+
+
+def _file_to_write(path: str | os.PathLike[str]) -> str:
+    check_file("path", path)
+    made_folder("the folder of path", Path(path).parent)
+    return os.fspath(path)
 
 
 @contextmanager
@@ -233,13 +243,14 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     _check_step(step)
     if missing := [name for name in ONNX_PACKAGES if importlib.util.find_spec(name) is None]:
         raise ImportError(f"Writing ONNX needs {' and '.join(missing)}; {how_to_install('export')}.")
+    path = _file_to_write(path)
     example = step.example()
     batch = th.export.Dim("n")
     with th.no_grad(), _exporter_without_remarks():
         th.onnx.export(
             step,
             example,
-            os.fspath(path),
+            path,
             input_names=list(step.input_names),
             output_names=list(OUTPUTS),
             opset_version=OPSET,
