@@ -50,7 +50,7 @@ def run(options: dict[str, Any]) -> int:
     """
     import numpy as np
 
-    from sb3_dreamer_urlb.evaluation.agent_rows import results_of, row_of
+    from sb3_dreamer_urlb.evaluation.agent_rows import CHANGED, env_columns, results_of, row_of
     from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
 
@@ -72,7 +72,7 @@ def run(options: dict[str, Any]) -> int:
         for chosen in plan:
             played = run_evaluation(model, env, options["episodes"], options["seed"], chosen, not options["stochastic"])
             evaluations.append(played)
-            _print(options, played)
+            _print(options, played, changed=CHANGED in env_columns(env))
             if "rows" in options:
                 row = row_of(model, env, played, **about)
                 print(f"  {'added to' if append_row(options['rows'], row) else 'stands already in'} {options['rows']}")
@@ -110,12 +110,12 @@ def _columns(texts: Any) -> dict[str, Any]:
     return columns
 
 
-def _print(options: dict[str, Any], played: Evaluation) -> None:
+def _print(options: dict[str, Any], played: Evaluation, changed: bool) -> None:
     from sb3_dreamer_urlb.evaluation.names import TASKS, columns_of_id, counted
     from sb3_dreamer_urlb.evaluation.scores import normalized_score
 
     who = "actor alone" if played.planner == "none" else f"planner {played.planner}"
     line = f"{options['env']}, {who}: return {played.mean:.1f} ± {played.std:.1f} ({counted(len(played.returns), 'episode')}"
     name = "{domain}-{task}".format(**columns_of_id(options["env"]))
-    score = f", {100 * normalized_score(name, played.mean):.1f} % of Dreamer@2M" if name in TASKS else ""
+    score = f", {100 * normalized_score(name, played.mean):.1f} % of Dreamer@2M" if name in TASKS and not changed else ""
     print(f"{line}, {played.seconds:.0f} s){score}")

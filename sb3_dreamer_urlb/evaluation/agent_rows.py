@@ -6,7 +6,9 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.envs.facts import env_attribute
@@ -18,6 +20,10 @@ from sb3_dreamer_urlb.phases import PHASES
 
 #: classes of algorithms → what a run of theirs without pre-training is called
 FROM_SCRATCH = {"DreamerV2": "dreamer", "DrQv2": "drqv2"}
+#: column of what :func:`changed_arguments` tells; rows of the task as it is registered have none
+CHANGED = "environment"
+#: arguments of environments that other columns have, or that only people see
+IN_OTHER_COLUMNS = {"domain", "task", "observation", "render_mode"}
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3", "dm-control", "mujoco")
 
 
@@ -104,7 +110,25 @@ def env_columns(env: VecEnv) -> dict[str, Any]:
         columns["task"] = env_attribute(env, CLASS, type(env.unwrapped).__name__)
     if isinstance(given.get("observation"), str) and given["observation"] != "pixels":
         columns["observation"] = given["observation"]
+    if spec is not None and (changed := changed_arguments(spec)):
+        columns[CHANGED] = changed
     return columns
+
+
+def changed_arguments(spec: EnvSpec) -> str:
+    """What ``gymnasium.make`` was told beside the id that makes another task of it, ``"max_episode_steps=60"``.
+
+    :param spec: of the environment
+    """
+    registered = gymnasium.registry.get(spec.id)
+    usual = {} if registered is None else registered.kwargs
+    given = {name: value for name, value in spec.kwargs.items() if name not in IN_OTHER_COLUMNS}
+    if registered is not None and spec.max_episode_steps != registered.max_episode_steps:
+        given["max_episode_steps"] = spec.max_episode_steps
+    changed = {name: value for name, value in given.items() if name not in usual or repr(value) != repr(usual[name])}
+    # Objects would be written with their address.
+    plain = (str, int, float, bool, type(None))
+    return ", ".join(f"{name}={value if isinstance(value, plain) else '...'}" for name, value in sorted(changed.items()))
 
 
 def versions() -> str:

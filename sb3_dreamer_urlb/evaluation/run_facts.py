@@ -18,7 +18,7 @@ from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
 
 #: a snapshot of each of these names is looked for, in this order; then the newest zip
-SNAPSHOTS = ("snapshot.zip", "finetuned.zip", "best_model.zip")
+SNAPSHOTS = ("snapshot.zip", "checkpoint/snapshot.zip", "finetuned.zip", "best_model.zip")
 #: films whose names begin so
 AGENT, OPEN_LOOP = "agent", "open_loop"
 #: beyond this a film makes the page too heavy for a phone
@@ -123,7 +123,8 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         films = [path for path in films if path.stat().st_size <= MAX_FILM_BYTES]
         if films:
             facts.films[kind] = films[-1]
-    for path in [*sorted(folder.glob("*.csv")), *(rows or [])]:
+    files = {path.resolve(): path for path in [*sorted(folder.glob("*.csv")), *(rows or [])]}
+    for path in files.values():
         # Stable-Baselines3's: the log, and what Monitor keeps.
         if path.name == "progress.csv" or path.name.endswith("monitor.csv"):
             continue

@@ -180,6 +180,22 @@ def test_columns_of_the_environment() -> None:
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, None),
+        ({"render_mode": "rgb_array"}, None),
+        ({"max_episode_steps": 60}, "max_episode_steps=60"),
+        ({"max_episode_steps": 60, "action_repeat": 4}, "action_repeat=4, max_episode_steps=60"),
+    ],
+)
+def test_another_task_under_the_same_id_has_a_column(changes: dict[str, Any], told: str | None) -> None:
+    env = make_vec_env("urlb/walker-run-v0", 1, env_kwargs={"observation": "state", **changes})
+    expected = {"domain": "walker", "task": "run", "observation": "state"}
+    assert env_columns(env) == (expected if told is None else {**expected, "environment": told})
+    env.close()
+
+
 @pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
 @pytest.mark.parametrize("wrapper", [Monitor, gymnasium.wrappers.RecordEpisodeStatistics])
 def test_an_environment_without_an_id_is_called_after_its_class(kind: Any, wrapper: Any) -> None:

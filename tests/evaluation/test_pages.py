@@ -268,3 +268,15 @@ def test_runs_that_share_no_log(run: Path, tmp_path: Path, capsys: Any) -> None:
 def test_long_lines_are_thinned() -> None:
     points = [(float(i), float(i)) for i in range(5000)]
     assert len(thinned(points)) == 400 and thinned(points)[0] == points[0] and thinned(points)[-1] == points[-1]
+
+
+def test_the_last_checkpoint_comes_before_the_best_model_and_rows_count_once(run: Path, tmp_path: Path) -> None:
+    """A run of rl_zoo3's has the first in a folder of its own; ``evaluate`` plays that one, too."""
+    (tmp_path / "checkpoint").mkdir()
+    for name in ("best_model.zip", "checkpoint/snapshot.zip"):
+        (tmp_path / name).write_bytes((run / "snapshot.zip").read_bytes())
+    (tmp_path / "rows.csv").write_bytes((run / "rows.csv").read_bytes())
+    once = read_run(tmp_path)
+    assert once.snapshot == tmp_path / "checkpoint/snapshot.zip" and once.rows
+    twice = read_run(tmp_path, [tmp_path / "checkpoint/../rows.csv"])
+    assert [row.key for row in twice.rows] == [row.key for row in once.rows]
