@@ -220,3 +220,10 @@ def test_the_command_says_what_is_wrong(
 def test_no_snapshot(tmp_path: Path, capsys: Any) -> None:
     assert main(["evaluate", str(tmp_path / "none.zip"), "--env", "Counter-v0"]) == 2
     assert "none.zip" in capsys.readouterr().err
+
+
+def test_rows_that_cannot_be_written_are_told_before_the_first_step(tiny_model, tmp_path):
+    model = tiny_model(CounterEnv(20, **WALKER), seed=0)
+    with pytest.raises(IsADirectoryError, match="is a folder: give a CSV file"):
+        model.learn(5, callback=EvaluationCallback(CounterEnv(20, **WALKER), rows=tmp_path))
+    assert model.num_timesteps == 0
