@@ -11,7 +11,7 @@ import fcntl
 import os
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
 from sb3_dreamer_urlb.snapshots import normalization
 from sb3_dreamer_urlb.snapshots import replay as replay_snapshot
-from sb3_dreamer_urlb.snapshots.archive import SnapshotError, blaming, reading
+from sb3_dreamer_urlb.snapshots.archive import CallersError, SnapshotError, blaming, reading
 from sb3_dreamer_urlb.snapshots.atomic import TEMPORARY
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
@@ -207,17 +207,22 @@ class RunFolder:
             warnings.warn(f"{self.snapshot} holds no statistics of VecNormalize: they begin anew.")
         if normalizer is not None and self.statistics:
             with blaming(str(self.snapshot)):
-                texts = normalization.differing(self.statistics, normalizer)
+                self._compare_settings(normalizer, self.statistics)
                 normalization.restore(normalizer, self.statistics)
-            if texts:
-                raise ValueError(
-                    f"The run in {self.path} normalises with VecNormalize({texts[0]}), its environment is wrapped in "
-                    f"VecNormalize({texts[1]}) now: a run keeps its arguments."
-                )
             training, normalizer.training = normalizer.training, False
             restart()
             normalizer.training = training
         self.statistics = None
+
+    def _compare_settings(self, normalizer: VecNormalize, stored: Mapping[str, th.Tensor]) -> None:
+        """:raises CallersError: if the environment shows other numbers, or pays others, than the run's did"""
+        # rl_zoo3 gives VecNormalize the discount of the model, which may change where a run goes on.
+        discount, others = ["gamma"], [name for name in normalization.SETTING_NAMES if name != "gamma"]
+        said = "The run in {} normalises with VecNormalize({}), its environment is wrapped in VecNormalize({}) now: {}"
+        if texts := normalization.differing(stored, normalizer, others):
+            raise CallersError(ValueError(said.format(self.path, *texts, "a run keeps its arguments.")))
+        if texts := normalization.differing(stored, normalizer, discount):
+            warnings.warn(said.format(self.path, *texts, "rewards are scaled otherwise from here on."))
 
     def _restored(self, buffer: SequenceReplayBuffer) -> None:
         self._buffer, self.identity = weakref.ref(buffer), _identity(self.snapshot)
