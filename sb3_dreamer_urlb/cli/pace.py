@@ -54,6 +54,10 @@ class Amount:
         return self.steps * pace.step + acting + self.updates * pace.update
 
 
+#: share of the learning that must be done for a pace: of a warm-up's last moments and the first updates there is none
+ENOUGH = 0.04
+
+
 @dataclass
 class Left:
     """What is left of a run that learns and then plays: as was expected, times how much slower it has been so far.
@@ -73,13 +77,13 @@ class Left:
         """
         :param frames: learnt by now
         :param now: in seconds, of any clock
-        :return: how long it will still take; None at the first look
+        :return: how long it will still take; None at the first look, and until there is a pace
         """
         if self.first is None:
             self.first = frames, now
         done, began = self.first
         expected = self.learning(frames) - self.learning(done)
-        if expected <= 0:
+        if expected <= 0 or expected < ENOUGH * self.learning(self.total):
             return None
         return (now - began) / expected * (self.learning(self.total) - self.learning(frames) + self.after)
 

@@ -65,6 +65,12 @@ def test_what_is_left_follows_the_pace_so_far(slower, first, further):
     assert left.seconds(done, now) == pytest.approx(slower * (2 * (20 - done) + 3))
 
 
+def test_too_little_learning_is_no_pace():
+    left = pace.Left(lambda frames: 2.0 * frames, 3.0, 1000)
+    assert left.seconds(1, 0.0) is None and left.seconds(40, 1e6) is None
+    assert left.seconds(61, 240.0) == pytest.approx(2 * (2 * 939 + 3))
+
+
 def fitted(monkeypatch, config, update):
     monkeypatch.setattr(pace, "measure", lambda *_: Pace(update, 0.0, 0.0, 0.0))
     env = CounterEnv(120, domain="walker", action_repeat=2)
