@@ -197,8 +197,7 @@ class CollectingAlgorithm(SavingAlgorithm):
         for i in np.flatnonzero(dones):
             _put(next_obs, int(i), self._last_of_episode(int(i), infos[i]))
         env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        for seen in (next_obs, new_obs):
-            self._check_classes(seen, "step")
+        self._check_classes("step", next_obs, new_obs)
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
         # Environments may write the next observation into the same arrays.
@@ -246,15 +245,16 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._touches = last_touches(self.env)
         # Environments may write the next observation into the same arrays.
         self._last_obs = copy.deepcopy(self._last_obs)
-        self._check_classes(self._last_obs, "reset")
+        self._check_classes("reset", self._last_obs)
         self._leave_standing()
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._last_obs)
 
-    def _check_classes(self, seen: Any, asked: str) -> None:
+    def _check_classes(self, asked: str, *observations: Any) -> None:
         """Before anything out of its space is acted on or kept; ``asked`` is what the environments did."""
         with asking_to(asked):
-            check_classes("The environments' observation", seen, self.observation_space)
+            for seen in observations:
+                check_classes("The environments' observation", seen, self.observation_space)
 
     def _leave_standing(self) -> None:
         assert self.env is not None and self._last_episode_starts is not None

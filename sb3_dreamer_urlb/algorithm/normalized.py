@@ -16,7 +16,7 @@ def _how(normalizer: VecNormalize | None) -> dict[str, object] | None:
     """How observations are normalised, statistics aside; None if they are not."""
     if normalizer is None or not normalizer.norm_obs:
         return None
-    return {name: getattr(normalizer, name) for name in ("norm_obs_keys", "clip_obs", "epsilon")}
+    return {name: getattr(normalizer, name) for name in ("norm_obs_keys", *normalization.OF_OBSERVATIONS)}
 
 
 def check(before: VecNormalize | None, after: VecNormalize | None) -> None:
@@ -53,29 +53,29 @@ def go_on(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
     A VecNormalize that has seen nothing takes the statistics over. Warns where the agent would see other numbers for the same
     state.
 
-    :param known: all statistics of the VecNormalize that it learnt behind, empty without
+    :param known: statistics and settings of the VecNormalize that it learnt behind, empty without
     :param after: of the environment, None without; changed in place
     """
-    whole, known = known, normalization.of_observations(known)
+    seen = normalization.of_observations(known)
     its = normalization.of_observations(normalization.pack(after))
     if after is None or not its:
-        if known:
+        if seen:
             warnings.warn(
                 "The model has learnt from observations behind VecNormalize, this environment shows them as they are: it "
                 "would see other numbers for the same state. Wrap it in VecNormalize, which takes the statistics over."
             )
         return
-    if known and (texts := normalization.differing(whole, after, normalization.OF_OBSERVATIONS)):
+    if seen and (texts := normalization.differing(known, after, normalization.OF_OBSERVATIONS)):
         warnings.warn(
             f"The model has learnt from observations through VecNormalize({texts[0]}), this environment has "
             f"VecNormalize({texts[1]}): it would see other numbers for the same state."
         )
     if not _has_seen_nothing(after):
         return
-    if {name: value.shape for name, value in known.items()} == {name: value.shape for name, value in its.items()}:
-        normalization.put(after, known)
+    if {name: value.shape for name, value in seen.items()} == {name: value.shape for name, value in its.items()}:
+        normalization.put(after, seen)
     else:
-        what = "of other observations" if known else "that its file knows nothing of"
+        what = "of other observations" if seen else "that its file knows nothing of"
         warnings.warn(
             f"The model goes on behind a VecNormalize {what}, which has seen nothing yet: it would see other numbers for the "
             "same state. Load the statistics that it learnt with: VecNormalize.load."

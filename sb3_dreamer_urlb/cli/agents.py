@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-#: where runs of rl_zoo3 keep themselves
-IN_RUNS_OF_THE_ZOO = "checkpoint"
-
 
 def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     """Which environment, and what episodes.
@@ -120,11 +117,11 @@ def _file(snapshot: Path) -> Path:
 
     :raises FileNotFoundError: if a folder has none
     """
-    from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
+    from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT
 
     if not snapshot.is_dir():
         return snapshot
-    places = [snapshot / SNAPSHOT, snapshot / IN_RUNS_OF_THE_ZOO / SNAPSHOT]
+    places = [snapshot / SNAPSHOT, snapshot / CHECKPOINT / SNAPSHOT]
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         raise FileNotFoundError(f"{snapshot} has no checkpoint: neither {' nor '.join(map(str, places))} is there.")

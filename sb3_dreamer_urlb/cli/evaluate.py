@@ -67,12 +67,12 @@ def run(options: dict[str, Any]) -> int:
     planner = options["planner"]
     both = ("off",) if getattr(model, "planner", None) is None else ("on", "off")
     plan = both if planner == BOTH else (planner,)
-    evaluations = []
+    evaluations, changed = [], CHANGED in env_columns(env)
     try:
         for chosen in plan:
             played = run_evaluation(model, env, options["episodes"], options["seed"], chosen, not options["stochastic"])
             evaluations.append(played)
-            _print(options, played, changed=CHANGED in env_columns(env))
+            _print(options, played, changed)
             if "rows" in options:
                 row = row_of(model, env, played, **about)
                 print(f"  {'added to' if append_row(options['rows'], row) else 'stands already in'} {options['rows']}")

@@ -236,9 +236,10 @@ def to_onnx(step: ActingStep, path: str | os.PathLike[str]) -> None:
     """Write a step for ONNX runtimes, weights in the same file; any number of environments.
 
     :param step: what to write
-    :param path: of the file, taken as it is
+    :param path: of the file, taken as it is; missing folders are made
     :raises ImportError: without the extra ``export``
     :raises ValueError: for anything else
+    :raises OSError: if a folder has its name
     """
     _check_step(step)
     if missing := [name for name in ONNX_PACKAGES if importlib.util.find_spec(name) is None]:

@@ -17,13 +17,14 @@ from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 from sb3_dreamer_urlb.evaluation.names import columns_of_id
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row
 from sb3_dreamer_urlb.phases import PHASES
+from sb3_dreamer_urlb.snapshots import values
 
 #: classes of algorithms → what a run of theirs without pre-training is called
 FROM_SCRATCH = {"DreamerV2": "dreamer", "DrQv2": "drqv2"}
-#: column of what :func:`changed_arguments` tells; rows of the task as it is registered have none
+#: column of the arguments that make another task of an id; rows of the task as it is registered have none
 CHANGED = "environment"
-#: arguments of environments that other columns have, or that only people see
-IN_OTHER_COLUMNS = {"domain", "task", "observation", "render_mode"}
+#: arguments of environments that other columns have
+IN_OTHER_COLUMNS = {"domain", "task", "observation"}
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3", "dm-control", "mujoco")
 
 
@@ -110,25 +111,30 @@ def env_columns(env: VecEnv) -> dict[str, Any]:
         columns["task"] = env_attribute(env, CLASS, type(env.unwrapped).__name__)
     if isinstance(given.get("observation"), str) and given["observation"] != "pixels":
         columns["observation"] = given["observation"]
-    if spec is not None and (changed := changed_arguments(spec)):
-        columns[CHANGED] = changed
+    changed = {} if spec is None else {n: v for n, v in changed_arguments(spec).items() if n not in IN_OTHER_COLUMNS}
+    if changed:
+        columns[CHANGED] = _as_text(changed)
     return columns
 
 
-def changed_arguments(spec: EnvSpec) -> str:
-    """What ``gymnasium.make`` was told beside the id that makes another task of it, ``"max_episode_steps=60"``.
+def changed_arguments(spec: EnvSpec) -> dict[str, Any]:
+    """What ``gymnasium.make`` was told beside the id and otherwise than it is registered; not how to draw it.
 
     :param spec: of the environment
+    :return: as JSON
     """
     registered = gymnasium.registry.get(spec.id)
     usual = {} if registered is None else registered.kwargs
-    given = {name: value for name, value in spec.kwargs.items() if name not in IN_OTHER_COLUMNS}
+    given = {name: values.encode_or_describe(value) for name, value in spec.kwargs.items() if name != "render_mode"}
+    found = {n: value for n, value in given.items() if n not in usual or value != values.encode_or_describe(usual[n])}
     if registered is not None and spec.max_episode_steps != registered.max_episode_steps:
-        given["max_episode_steps"] = spec.max_episode_steps
-    changed = {name: value for name, value in given.items() if name not in usual or repr(value) != repr(usual[name])}
-    # Objects would be written with their address.
+        found["max_episode_steps"] = spec.max_episode_steps
+    return found
+
+
+def _as_text(arguments: dict[str, Any]) -> str:
     plain = (str, int, float, bool, type(None))
-    return ", ".join(f"{name}={value if isinstance(value, plain) else '...'}" for name, value in sorted(changed.items()))
+    return ", ".join(f"{name}={value if isinstance(value, plain) else '...'}" for name, value in sorted(arguments.items()))
 
 
 def versions() -> str:

@@ -16,9 +16,10 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.agent_rows import FROM_SCRATCH
 from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT
 
 #: a snapshot of each of these names is looked for, in this order; then the newest zip
-SNAPSHOTS = ("snapshot.zip", "checkpoint/snapshot.zip", "finetuned.zip", "best_model.zip")
+SNAPSHOTS = (SNAPSHOT, f"{CHECKPOINT}/{SNAPSHOT}", "finetuned.zip", "best_model.zip")
 #: films whose names begin so
 AGENT, OPEN_LOOP = "agent", "open_loop"
 #: beyond this a film makes the page too heavy for a phone

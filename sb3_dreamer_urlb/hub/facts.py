@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.evaluation.agent_rows import changed_arguments
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
 from sb3_dreamer_urlb.hub.privacy import plain_for_everybody, without_private_paths
 from sb3_dreamer_urlb.hub.wrappers import wrappers_of
@@ -110,13 +110,7 @@ def environment_arguments(spec: EnvSpec) -> dict[str, Any]:
     :param spec: of the environment
     :return: as JSON
     """
-    registered = gymnasium.registry.get(spec.id)
-    usual = {} if registered is None else registered.kwargs
-    given = {name: values.encode_or_describe(value) for name, value in spec.kwargs.items() if name != "render_mode"}
-    changed = {n: value for n, value in given.items() if n not in usual or value != values.encode_or_describe(usual[n])}
-    found: dict[str, Any] = plain_for_everybody(changed)
-    if registered is not None and spec.max_episode_steps != registered.max_episode_steps:
-        found["max_episode_steps"] = spec.max_episode_steps
+    found: dict[str, Any] = plain_for_everybody(changed_arguments(spec))
     return found
 
 

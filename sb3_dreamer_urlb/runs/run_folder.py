@@ -33,6 +33,8 @@ from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
 
 Model = TypeVar("Model", bound=SavedAlgorithm)
 
+#: the run folder within the folder that rl_zoo3 keeps a run in
+CHECKPOINT = "checkpoint"
 SNAPSHOT, REPLAY, LOCK = "snapshot.zip", "replay", "lock"
 FIELDS = {"number", "segments", "open", "evicted", "finished_count", "longest", "evaluation"}
 

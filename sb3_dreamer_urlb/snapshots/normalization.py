@@ -17,11 +17,13 @@ from sb3_dreamer_urlb.snapshots.tensors import Table
 #: what the names of these tensors begin with, beside the model's own
 PREFIX = "normalization."
 RETURN, OBSERVATION = "return", "observation"
-#: tensor of the settings, float64, in this order; files of before 0.2 lack it
+#: settings of a VecNormalize that are numbers
+NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
+#: tensor of the settings, float64, in this order; older files lack it
 SETTINGS = f"{PREFIX}settings"
-SETTING_NAMES = ("clip_obs", "epsilon", "clip_reward", "gamma", "norm_reward")
+SETTING_NAMES = (*NUMBERS, "norm_reward")
 #: those that change what an agent sees
-OF_OBSERVATIONS = SETTING_NAMES[:2]
+OF_OBSERVATIONS = ("clip_obs", "epsilon")
 
 
 def statistics(normalizer: VecNormalize) -> dict[str, RunningMeanStd]:

@@ -14,8 +14,8 @@ from sb3_dreamer_urlb.number_checks import is_finite_number
 from sb3_dreamer_urlb.snapshots import bounded_json, normalization
 from sb3_dreamer_urlb.snapshots.archive import PICKLE_BEGINS, blaming
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
+from sb3_dreamer_urlb.snapshots.normalization import NUMBERS
 
-NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
 FIELDS = {*NUMBERS, "norm_obs", "norm_reward", "norm_obs_keys", "statistics"}
 MAX_BYTES = 8 << 20
 PICKLE = (

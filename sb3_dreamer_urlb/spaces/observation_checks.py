@@ -65,8 +65,9 @@ def check_classes(name: str, observation: Any, space: spaces.Space[Any]) -> None
     :raises ValueError: naming the numbers and the space
     """
     if isinstance(space, spaces.Dict):
-        for part in set(space.keys()) & set(observation):
-            check_classes(f"{name} {part!r}", observation[part], space[part])
+        for part, its in space.spaces.items():
+            if part in observation:
+                check_classes(f"{name} {part!r}", observation[part], its)
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return
     array = np.asarray(observation)

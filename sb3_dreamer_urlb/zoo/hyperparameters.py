@@ -27,7 +27,7 @@ OWN_KEYS = (
 WHOLE_NUMBERS = {"n_envs", "frame_stack"}
 #: those that name classes, and what these are given without being asked
 CLASSES = {"callback": (), "env_wrapper": ("env",), "vec_env_wrapper": ("venv",)}
-#: arguments that rl_zoo3 hands over itself, and the options that say them
+#: arguments that rl_zoo3 hands over itself, from options of the same names
 OF_THE_COMMAND_LINE = {"env", "seed", "device", "verbose", "tensorboard_log"}
 #: keys whose values are nobody's to judge
 OF_THE_ENVIRONMENT = "env_kwargs"

@@ -37,8 +37,13 @@ def plot(arguments: list[str], prog: str) -> int:
 
     sys.argv = [prog, *rest]
     if own.output:
-        made_folder("the folder of --output", Path(own.output).parent)
-        plt.show = lambda *args, **kwargs: plt.savefig(own.output) if plt.gca().lines else None
+
+        def save(*args: Any, **kwargs: Any) -> None:
+            if plt.gca().lines:
+                made_folder("the folder of --output", Path(own.output).parent)
+                plt.savefig(own.output)
+
+        plt.show = save
     with told_in_a_line(prog), _counted(sys.modules[plot_train.__module__]) as counts, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "No artists with labels")  # told below, run by run
         plot_train()

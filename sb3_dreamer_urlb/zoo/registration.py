@@ -27,6 +27,7 @@ from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 from sb3_dreamer_urlb.zoo import configs, env_arguments, hyperparameters, mistakes, pretraining, resuming, schedules
@@ -228,7 +229,7 @@ def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
         return
     evaluation = next((callback for callback in manager.callbacks if isinstance(callback, EvalCallback)), None)
     options = {"evaluation": evaluation, "verbose": int(manager.verbose > 0), "resume": "auto", **manager.checkpoint_options}
-    manager.callbacks.append(RunCheckpointCallback(Path(manager.save_path) / resuming.CHECKPOINT, **options))
+    manager.callbacks.append(RunCheckpointCallback(Path(manager.save_path) / CHECKPOINT, **options))
 
 
 def _load_pretrained_agent(
@@ -245,7 +246,7 @@ def _load_pretrained_agent(
     if getattr(manager, "resumed_run", None) is not None:
         changed = {name: hyperparams[name] for name in manager.custom_hyperparams or {} if name in hyperparams}
         own = {"tensorboard_log": manager.tensorboard_log, "verbose": manager.verbose}
-        folder = manager.resumed_run / resuming.CHECKPOINT
+        folder = manager.resumed_run / CHECKPOINT
         resumed = kind.resume(folder, env, device=manager.device, **{**own, **changed})
         assert resumed is not None
         _check_expected(manager.resumed_run, expected, resumed)

@@ -18,11 +18,9 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT, RunFolder, steps_done
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT, RunFolder, steps_done
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
-#: a run's own checkpoint, in its folder
-CHECKPOINT = "checkpoint"
 #: of the run, for what Monitor writes about a pre-training in another environment
 PRETRAINING_LOGS = "pretraining"
 AUTO = "auto"

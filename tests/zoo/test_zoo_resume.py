@@ -24,7 +24,7 @@ from whole_runs import RepeatingEnv, everything
 from zoo_commands import CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, model_in, train
 
 from sb3_dreamer_urlb import DreamerV2
-from sb3_dreamer_urlb.runs.run_folder import RunFolder, steps_done
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, RunFolder, steps_done
 from sb3_dreamer_urlb.zoo import resuming
 from sb3_dreamer_urlb.zoo.__main__ import main
 
@@ -90,7 +90,7 @@ def kill_when(folder: Path, arguments: list[str], run: Path, steps: int) -> None
         [sys.executable, "-m", "sb3_dreamer_urlb.zoo", *arguments], cwd=folder, env=env, stdout=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 250
-    while not (resuming.has_checkpoint(run) and steps_done(run / resuming.CHECKPOINT) >= steps):
+    while not (resuming.has_checkpoint(run) and steps_done(run / CHECKPOINT) >= steps):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
     time.sleep(0.1)  # somewhere after it
