@@ -41,6 +41,22 @@ def choose(precision: str, part: str, device: th.device | str, feature_size: int
     return {"float32": th.float32, "bfloat16": th.bfloat16}[precision]
 
 
+def suited(precision: str, device: th.device | str) -> str:
+    """A format that a file asks for: what was fast where it was written takes a hundred times as long elsewhere.
+
+    :param precision: one of ``PRECISIONS``; anything else is for others to refuse
+    :param device: where it would run
+    :return: the same, or ``"auto"``, with a warning
+    """
+    if precision != "bfloat16" or th.device(device).type != "cpu" or cpu_multiplies_short():
+        return precision
+    warnings.warn(
+        'The file asks for precision="bfloat16", for which this processor has no instructions: it gets precision="auto". '
+        'To have it nevertheless, about a hundred times as slow, give it again: precision="bfloat16".'
+    )
+    return "auto"
+
+
 def products(device: th.device | str, dtype: th.dtype) -> th.autocast:
     """Let products inside ``with products(...)`` run in ``dtype``; float32 leaves everything as it is."""
     return th.autocast(th.device(device).type, th.bfloat16, enabled=dtype == th.bfloat16)

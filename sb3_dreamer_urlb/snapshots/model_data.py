@@ -13,6 +13,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_dreamer_urlb import phases
 from sb3_dreamer_urlb.folders import check_folder
+from sb3_dreamer_urlb.nn.precision import suited
 from sb3_dreamer_urlb.number_checks import is_finite_number, is_integer, plain
 from sb3_dreamer_urlb.planning import Planner
 from sb3_dreamer_urlb.signatures import constructed, named_parameters
@@ -145,6 +146,8 @@ def blank(
             raise ValueError(f"its {name} is {str(value)[:80]!r}")
     if "tensorboard_log" not in given:
         decoded["tensorboard_log"] = _folder_of_logs(decoded.get("tensorboard_log"))
+    if "precision" not in given and "precision" in decoded:
+        decoded["precision"] = suited(decoded["precision"], get_device(device))
     if isinstance(decoded.get("train_freq"), list):
         decoded["train_freq"] = tuple(decoded["train_freq"])
     policy = custom.get("policy", custom.get("policy_class", data["policy"]))

@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dreamer_urlb.devices import chosen_device
+from sb3_dreamer_urlb.nn.precision import suited
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots import tensors, values
 from sb3_dreamer_urlb.snapshots.archive import TENSORS, Target, reading, writing
@@ -66,6 +67,8 @@ def load(
         parameters = {name: values.decode(value) for name, value in archive.data["parameters"].items()}
         _check_kind(kind, parameters, others)
         values.check_objects(archive.data["parameters"], custom_objects or {})
+        if "precision" in parameters.keys() - (custom_objects or {}).keys():
+            parameters["precision"] = suited(parameters["precision"], device)
         parameters.update(custom_objects or {})
         for name, value in parameters.items():
             if (missing := values.contains_custom(value)) is not None:

@@ -48,7 +48,8 @@ def test_auto_asks_for_hardware_and_size(short_products):
         assert precision.choose("bfloat16", "update", device, size) == th.bfloat16
 
 
-def test_the_argument_reaches_learner_and_planner_and_is_saved(tiny_model, tmp_path, capsys):
+def test_the_argument_reaches_learner_and_planner_and_is_saved(tiny_model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(precision, "cpu_multiplies_short", lambda: True)
     assert tiny_model().learner.dtype == th.float32  # too small to gain anything
     model = tiny_model(planner="dyna_mpc", precision="bfloat16", verbose=1)
     assert "bfloat16" in capsys.readouterr().out

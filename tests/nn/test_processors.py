@@ -11,9 +11,11 @@ import sys
 import every_combination
 import pytest
 import torch as th
+from fake_envs import CounterEnv
 from places import HELPERS, PYTHONPATH
 from told import told_meanwhile
 
+from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.nn import precision
 from sb3_dreamer_urlb.planning.prepared.prepacked import PrepackedLinear
 
@@ -63,6 +65,24 @@ def test_asking_for_it_warns_once_and_on_a_gpu_not_at_all(slow_at_bfloat16):
             == th.bfloat16
         )
     assert len(said) == 1 and "slow here" in said[0]
+
+
+@pytest.mark.parametrize("asked", precision.PRECISIONS)
+def test_a_file_of_a_faster_processor_takes_what_is_fast_here(tiny_model, tmp_path, request, asked):
+    model = tiny_model(CounterEnv(), precision=asked)
+    model.save(tmp_path / "model.zip")
+    model.policy.save(tmp_path / "policy.zip")
+    request.getfixturevalue("slow_at_bfloat16")
+    for load, path, given in (
+        (DreamerV2.load, "model.zip", {"precision": "bfloat16"}),
+        (type(model.policy).load, "policy.zip", {"custom_objects": {"precision": "bfloat16"}}),
+    ):
+        with told_meanwhile() as said:
+            assert load(tmp_path / path).precision == ("auto" if asked == "bfloat16" else asked)
+        assert len(said) == (asked == "bfloat16") and all("give it again" in text for text in said)
+        with told_meanwhile() as said:
+            assert load(tmp_path / path, **given).precision == "bfloat16"
+        assert not any("give it again" in text for text in said)
 
 
 @pytest.mark.parametrize("widens", [True, False])
