@@ -18,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, help="folder of a run, of the demo, or any with a snapshot or logs in it")
     parser.add_argument("--out", type=Path, help="page (default: report.html in the folder)")
     parser.add_argument("--rows", type=Path, nargs="+", default=[], help="evaluations beside those in the folder")
-    parser.add_argument("--command", dest="repeat", help="what repeats the run (default: the constructor's call)")
+    parser.add_argument(
+        "--command", dest="repeat", help="what repeats the run (default: the zoo's command, or the constructor's call)"
+    )
 
 
 def run(options: dict[str, Any]) -> int:

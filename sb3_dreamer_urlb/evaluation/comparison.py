@@ -10,6 +10,7 @@ from sb3_dreamer_urlb.evaluation.aggregate import Estimate, standard_error
 from sb3_dreamer_urlb.evaluation.run_facts import RunFacts
 from sb3_dreamer_urlb.evaluation.style import COLUMN, Picture, finish, frames_label, lines, new_figure
 from sb3_dreamer_urlb.evaluation.tables import Table, with_error
+from sb3_dreamer_urlb.unknown_names import did_you_mean
 
 POINTS = 100
 #: tags of logs, in words
@@ -31,11 +32,7 @@ def compare(
     wanted = [tag] if tag else list(tags)
     shared = [name for name in wanted if all(run.series.get(name) for _, run in runs)]
     if not shared:
-        lacking = [str(run.folder) for _, run in runs if not any(run.series.get(name) for name in wanted)]
-        raise ValueError(
-            f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}. A run logs with "
-            "tensorboard_log=... (--tensorboard-log of the zoo), and what it logs has its name in --tag."
-        )
+        raise ValueError(_no_such_log(wanted, [run for _, run in runs]))
     name = shared[0]
     unknown = [str(run.folder) for _, run in runs if run.action_repeat is None]
     if unknown and len(unknown) < len(runs):
@@ -70,6 +67,25 @@ def compare(
         f"({counts}).{one}{switched}"
     )
     return finish("comparison", figure, caption, False, handles, 2), table, _settings(groups)
+
+
+def _no_such_log(wanted: Sequence[str], runs: Sequence[RunFacts]) -> str:
+    """
+    :param wanted: tags, of which one would have been enough
+    :param runs: which do not share any
+    :return: what to tell
+    """
+    lacking = [str(run.folder) for run in runs if not any(run.series.get(name) for name in wanted)]
+    shared = sorted(set.intersection(*(set(run.series) for run in runs)))
+    there_are = (
+        f"--tag takes what all of them log: {', '.join(shared)}.{did_you_mean(wanted, shared)}"
+        if shared
+        else (
+            "A run logs with tensorboard_log=... (--tensorboard-log of the zoo, whose folder is to be named then), "
+            "and what it logs has its name in --tag."
+        )
+    )
+    return f"Not all runs have a log of {' or '.join(wanted)}: {', '.join(lacking) or 'each has another'}. {there_are}"
 
 
 def _mean_curve(members: Sequence[RunFacts], name: str) -> dict[int, Estimate]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import re
@@ -16,6 +15,7 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.agent_rows import FROM_SCRATCH
 from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
+from sb3_dreamer_urlb.evaluation.run_logs import Logs, Series, number, read_logs
 from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT
 
 #: a snapshot of each of these names is looked for, in this order; then the newest zip
@@ -24,8 +24,6 @@ SNAPSHOTS = (SNAPSHOT, f"{CHECKPOINT}/{SNAPSHOT}", "finetuned.zip", "best_model.
 AGENT, OPEN_LOOP = "agent", "open_loop"
 #: beyond this a film makes the page too heavy for a phone
 MAX_FILM_BYTES = 12 << 20
-
-Series = list[tuple[float, float]]
 
 
 @dataclass
@@ -83,6 +81,13 @@ class RunFacts:
         return None
 
     @property
+    def command(self) -> str | None:
+        """That began the run, if the folder is rl_zoo3's; without the folder of Python."""
+        found = sorted(self.folder.glob("*/command.txt"))
+        text = found[0].read_text(encoding="utf-8", errors="replace").strip() if len(found) == 1 else ""
+        return re.sub(r"^\S*/", "", text) or None
+
+    @property
     def begins_with_fine_tuning(self) -> bool:
         """Whether the pre-training was another run: the steps that this one counts are those of its fine-tuning."""
         counters = self.counters
@@ -117,8 +122,9 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         raise FileNotFoundError(f"{folder} is no folder of a run.")
     facts = RunFacts(folder)
     _read_snapshot(facts)
-    _read_logs(facts)
-    facts.notes += damaged_files(folder)
+    logs = read_logs(folder, facts.switch, int(facts.arguments.get("stats_window_size") or Logs.window))
+    facts.series = logs.series
+    facts.notes += [*logs.notes, *damaged_files(folder)]
     for kind in (AGENT, OPEN_LOOP):
         films = sorted(folder.rglob(f"{kind}*.gif"), key=lambda path: path.stat().st_mtime)
         films = [path for path in films if path.stat().st_size <= MAX_FILM_BYTES]
@@ -158,6 +164,8 @@ def _read_snapshot(facts: RunFacts) -> None:
         try:
             with reading(path, "model") as archive:
                 facts.snapshot, facts.data, facts.system = path, archive.data, archive.system_info
+            if path not in named and len(others) > 1:
+                facts.notes.append(f"Of {len(others)} models in the folder the newest is shown, {path.name}.")
             return
         except SnapshotError as error:
             facts.notes.append(str(error))
@@ -185,20 +193,6 @@ def _is_about(row: Row, facts: RunFacts) -> bool:
     return length and row.method in method and same
 
 
-def _log_folders(folder: Path, name: str) -> list[Path]:
-    """Folders of one run that hold a log: the run's own, or else the one below, or those that a logger numbers.
-
-    :raises ValueError: where runs lie beside each other
-    """
-    if any(folder.glob(name)):
-        return [folder]
-    found = sorted({path.parent for path in folder.rglob(name)})
-    runs = {path.parent / re.sub(r"_\d+$", "", path.name) for path in found}
-    if len(runs) > 1:
-        raise ValueError(f"{folder} holds several runs, not one: name one of {', '.join(map(str, found))}.")
-    return found
-
-
 def damaged_files(folder: Path) -> list[str]:
     """What lies in the folder of a run and cannot be read, a line each.
 
@@ -209,7 +203,7 @@ def damaged_files(folder: Path) -> list[str]:
         first, columns, *lines = [*path.read_text(encoding="utf-8", errors="replace").splitlines(), "", ""]
         if not first.startswith("#{") or not {"r", "l", "t"} <= set(columns.split(",")):
             found.append(f"{path.name} is damaged: it is no log of Stable-Baselines3's Monitor.")
-        elif bad := sum(bool(line) and None in map(_number, line.split(",")[:3]) for line in lines):
+        elif bad := sum(bool(line) and None in map(number, line.split(",")[:3]) for line in lines):
             found.append(f"{path.name} is damaged: {counted(bad, 'line')} of it cannot be read.")
     for path in sorted(folder.glob("*.vec_normalize.json")):
         try:
@@ -218,50 +212,6 @@ def damaged_files(folder: Path) -> list[str]:
         except (ValueError, AttributeError) as error:
             found.append(f"{path.name} is damaged: {error}.")
     return found
-
-
-def _read_logs(facts: RunFacts) -> None:
-    for folder in _log_folders(facts.folder, "progress.csv"):
-        _read_progress(facts, folder / "progress.csv")
-    folders = _log_folders(facts.folder, "events.out.tfevents.*")
-    if facts.series or not folders:
-        return
-    from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
-
-    for folder in folders:
-        events = EventAccumulator(str(folder), {SCALARS: 2000})
-        events.Reload()
-        for tag in events.Tags()["scalars"]:
-            points = [(float(event.step), float(event.value)) for event in events.Scalars(tag)]
-            facts.series.setdefault(tag, []).extend(points)
-    for points in facts.series.values():
-        points.sort()
-
-
-def _read_progress(facts: RunFacts, path: Path) -> None:
-    bad = 0
-    with open(path, newline="", encoding="utf-8", errors="replace") as file:
-        # A line that holds a null byte ends the reading of a file.
-        lines = csv.DictReader(line.replace("\0", "\N{REPLACEMENT CHARACTER}") for line in file)
-        for line in lines:
-            step = _number(line.get("time/total_timesteps"))
-            # More fields than columns stand under no name.
-            bad += step is None or None in line
-            for tag, text in line.items():
-                value = _number(text)
-                if tag and step is not None and value is not None:
-                    facts.series.setdefault(tag, []).append((step, value))
-        empty = not lines.fieldnames
-    if bad or empty:
-        what = "it is empty" if empty else f"{counted(bad, 'line')} of it cannot be read"
-        facts.notes.append(f"{path.relative_to(facts.folder)} is damaged: {what}.")
-
-
-def _number(text: Any) -> float | None:
-    try:
-        return float(text)
-    except (TypeError, ValueError):
-        return None
 
 
 def thinned(points: Series, most: int = 400) -> Series:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.evaluation.names import TASKS
-from sb3_dreamer_urlb.evaluation.run_facts import AGENT, RunFacts, Series, thinned
+from sb3_dreamer_urlb.evaluation.run_facts import AGENT, RunFacts, thinned
+from sb3_dreamer_urlb.evaluation.run_logs import Series
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score, published_returns
 from sb3_dreamer_urlb.evaluation.style import COLORS, RC, check_matplotlib_installed, frames_label
 from sb3_dreamer_urlb.version import how_to_install
@@ -36,7 +37,7 @@ def run_page(facts: RunFacts, command: str | None = None) -> str:
     """The page of a run.
 
     :param facts: about it
-    :param command: that repeats it; None writes the constructor's call
+    :param command: that repeats it; None writes what the folder tells, or the constructor's call
     :return: HTML
     :raises ImportError: if the extra ``plots`` is not installed
     """
@@ -52,7 +53,7 @@ def run_page(facts: RunFacts, command: str | None = None) -> str:
         evaluations=[_evaluation(row) for row in facts.rows],
         configuration=sorted(((name, _shown(value)) for name, value in facts.arguments.items()), key=lambda pair: pair[0]),
         spaces={name: _shown(facts.data[name]) for name in ("observation_space", "action_space") if name in facts.data},
-        command=command or _call(facts),
+        command=command or facts.command or _call(facts),
         warnings=facts.warnings(),
     )
 
@@ -120,9 +121,10 @@ def _call(facts: RunFacts) -> str:
             f"model = DreamerV2.load(SNAPSHOT, env=env)  # of a pre-training of {frames} frames\n"
             f"model.fine_tune({kept})\nmodel.learn({steps}, reset_num_timesteps=True)"
         )
-    switch = f", callback=PhaseSwitchCallback({frames})" if frames else ""
+    # No file knows the environments.
+    switch = f", callback=PhaseSwitchCallback({frames}))  # with env=..., if the task was learnt in another" if frames else ")"
     steps = facts.counters.get("num_timesteps", 0)
-    return f"model = DreamerV2({facts.data.get('policy')!r}, env, {arguments})\nmodel.learn({steps}{switch})"
+    return f"model = DreamerV2({facts.data.get('policy')!r}, env, {arguments})\nmodel.learn({steps}{switch}"
 
 
 def _shown(value: Any) -> str:
@@ -135,7 +137,7 @@ def _shown(value: Any) -> str:
 def _charts(series: Mapping[str, Series], switch: float | None, repeat: int | None) -> dict[str, list[str]]:
     charts: dict[str, list[str]] = {}
     for heading, beginnings in CHARTS.items():
-        tags = [tag for tag in series if tag.startswith(beginnings) and len(series[tag]) > 1]
+        tags = [tag for tag in series if tag.startswith(beginnings)]
         if tags:
             charts[heading] = [chart({tag: series[tag]}, tag, switch, repeat) for tag in sorted(tags)]
     return charts

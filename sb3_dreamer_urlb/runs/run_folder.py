@@ -35,6 +35,8 @@ Model = TypeVar("Model", bound=SavedAlgorithm)
 
 #: the run folder within the folder that rl_zoo3 keeps a run in
 CHECKPOINT = "checkpoint"
+#: of the same folder: what Monitor writes about a pre-training in another environment
+PRETRAINING_LOGS = "pretraining"
 SNAPSHOT, REPLAY, LOCK = "snapshot.zip", "replay", "lock"
 FIELDS = {"number", "segments", "open", "evicted", "finished_count", "longest", "evaluation"}
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dreamer_urlb.callbacks.phase_switch import PhaseSwitchCallback
 from sb3_dreamer_urlb.envs import PRIMAL_TASK, env_id
 from sb3_dreamer_urlb.envs.registration import meant_by
-from sb3_dreamer_urlb.zoo.resuming import PRETRAINING_LOGS
+from sb3_dreamer_urlb.runs.run_folder import PRETRAINING_LOGS
 
 #: values of the key ``pretrain_env``: the primal task's environment, or the one that is fine-tuned in
 PRIMAL, SAME = CHOICES = ("primal", "same")

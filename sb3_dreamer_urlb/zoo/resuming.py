@@ -18,11 +18,9 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT, RunFolder, steps_done
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, PRETRAINING_LOGS, SNAPSHOT, RunFolder, steps_done
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
-#: of the run, for what Monitor writes about a pre-training in another environment
-PRETRAINING_LOGS = "pretraining"
 AUTO = "auto"
 #: options that say how a run begins, or something else than to train; not taken from the run that goes on
 OTHER = ("trained_agent", "conf_file", "hyperparams", "optimize_hyperparameters", "trial_id", "storage", "study_name", "uuid")

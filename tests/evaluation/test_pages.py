@@ -14,14 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_envs import CounterEnv
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
 
-from sb3_dreamer_urlb import EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
+from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.cli.compare import compare_runs
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.run_facts import read_run, thinned
+from sb3_dreamer_urlb.evaluation.run_logs import read_logs
 from sb3_dreamer_urlb.evaluation.run_page import _summary
 
 SECTIONS = ("summary", "warnings", "evaluation", "films", "curves", "repeat", "configuration", "environment", "versions")
@@ -59,8 +62,6 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a real, tiny run with both phases, logs, rows and films."""
-    from sb3_dreamer_urlb import DreamerV2
-
     folder = tmp_path_factory.mktemp("runs") / "tiny"
     model = DreamerV2("CnnPolicy", CounterEnv(20, **WALKER), preset="tiny", seed=0, device="cpu", intrinsic_reward="lbs")
     model.set_logger(configure(str(folder), ["csv"]))
@@ -263,6 +264,67 @@ def test_labels_are_no_formulas(run: Path, tmp_path: Path) -> None:
 def test_runs_that_share_no_log(run: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["compare", str(run), "--tag", "train/none", "--out", str(tmp_path / "page.html")]) == 2
     assert "Not all runs have a log of train/none" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as rl_zoo3 has it, a log of Stable-Baselines3's logger beside."""
+    folder = tmp_path_factory.mktemp("logs") / "walker_1"
+    env = Monitor(CounterEnv(7, **WALKER), str(folder / "0"))
+    model = DreamerV2("CnnPolicy", env, preset="tiny", seed=0, device="cpu", stats_window_size=3)
+    model.set_logger(configure(str(folder), ["csv"]))
+    evaluation = EvalCallback(
+        Monitor(CounterEnv(9, **WALKER)), eval_freq=20, n_eval_episodes=1, log_path=str(folder), verbose=0
+    )
+    model.learn(160, callback=evaluation, log_interval=1)
+    for name in ("old.zip", "walker.zip"):
+        model.save(folder / name)
+    (folder / "walker").mkdir()
+    (folder / "walker" / "command.txt").write_text("/home/of/somebody/python -m rl_zoo3.train --algo dreamerv2")
+    return folder
+
+
+def test_what_monitor_and_evaluations_keep_is_what_the_logger_had(kept: Path, tmp_path: Path) -> None:
+    logged = read_run(kept).series
+    shutil.copytree(kept, tmp_path / "run", ignore=shutil.ignore_patterns("progress.csv"))
+    facts = read_run(tmp_path / "run")
+    assert set(facts.series) == {"rollout/ep_rew_mean", "eval/mean_reward"}
+    for tag, points in facts.series.items():
+        theirs = dict(logged[tag])
+        assert len(points) >= 8 and dict(points) == pytest.approx({step: theirs[step] for step, _ in points}, rel=1e-5)
+    assert facts.command == "python -m rl_zoo3.train --algo dreamerv2"
+    assert any("Of 2 models in the folder the newest is shown, walker.zip" in note for note in facts.notes)
+    assert main(["report", str(tmp_path / "run")]) == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert page.count("<svg") == 2 and "rl_zoo3.train" in page and "/home/of" not in page
+
+
+def test_a_pre_training_elsewhere_comes_before_its_fine_tuning(tmp_path: Path) -> None:
+    for folder, begin, lengths in ((tmp_path / "pretraining", 100.0, (50, 50)), (tmp_path, 200.0, (40, 10))):
+        folder.mkdir(exist_ok=True)
+        lines = [f"{length / 10},{length},{second}.5" for second, length in enumerate(lengths)]
+        (folder / "0.monitor.csv").write_text("\n".join([f'#{{"t_start": {begin}}}', "r,l,t", *lines, "broken,,"]))
+    found = read_logs(tmp_path, switch=120, window=100).series["rollout/ep_rew_mean"]
+    assert found == [(50, 5), (100, 5), (160, 4), (170, 2.5)]
+
+
+def test_one_line_of_a_log_is_a_point(tmp_path: Path) -> None:
+    (tmp_path / "progress.csv").write_text("time/total_timesteps,rollout/ep_rew_mean\n100,3.5\n")
+    assert main(["report", str(tmp_path)]) == 0
+    assert (tmp_path / "report.html").read_text().count("<svg") == 1
+
+
+def test_unknown_tags_are_answered_with_those_there_are(run: Path, tmp_path: Path, capsys: Any) -> None:
+    assert main(["compare", str(run), "--tag", "train/imageloss", "--out", str(tmp_path / "c.html")]) != 0
+    said = capsys.readouterr().err
+    assert "rollout/ep_rew_mean" in said and "Did you mean 'train/image_loss' or" in said
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4 broken", b"no zip"])
+def test_damaged_evaluations_are_named(run: Path, tmp_path: Path, content: bytes) -> None:
+    shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("progress.csv"))
+    (tmp_path / "run" / "evaluations.npz").write_bytes(content)
+    assert any("evaluations.npz is damaged" in note for note in read_run(tmp_path / "run").warnings())
 
 
 def test_long_lines_are_thinned() -> None:
