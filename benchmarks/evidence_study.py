@@ -99,6 +99,8 @@ STUDY: dict[str, tuple[Tier, ...]] = {
         (("lbs-kept", "scratch"), ("run", "flip"), 10),
         (("random-fresh", "lbs-fresh"), ("run", "flip"), 3),
         (("plan2explore-kept",), ("run", "flip"), 3),
+        # Their pre-training is done: does the model alone carry it, or the actor, too?
+        (("lbs-fresh",), ("run", "flip"), 10),
         (tuple(arm for arm in ARMS if ARMS[arm].changes), ("flip",), 3),
         (("lbs-kept", "scratch"), ("spin",), 10),
         (("random-fresh", "lbs-fresh", "plan2explore-kept"), ("run", "flip", "spin"), 10),
