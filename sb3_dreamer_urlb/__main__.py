@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
-from sb3_dreamer_urlb.command_parser import CommandParser
+from sb3_dreamer_urlb.command_parser import CommandParser, at_least
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import __version__
 
@@ -34,17 +35,19 @@ DESCRIPTION = (
 )
 
 
-@ending_with_its_reader()
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line and run the command.
+def command_modules() -> dict[str, ModuleType]:
+    """Command → its module."""
+    return {name.replace("_", "-"): import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
 
-    :param argv: arguments, those of the process if None
-    :return: exit status
+
+def command_line(modules: Mapping[str, ModuleType]) -> tuple[CommandParser, Mapping[str, argparse.ArgumentParser]]:
+    """The parser of everything, and that of each command by its name.
+
+    :param modules: of the commands that have one
     """
     parser = CommandParser(prog="sb3-dreamer-urlb", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"sb3_dreamer_urlb {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", title="commands")
-    modules = {name.replace("_", "-"): import_module(f"sb3_dreamer_urlb.cli.{name}") for name in MODULES}
     for name in sorted({*modules, *OTHERS}):
         if name in modules:
             module = modules[name]
@@ -52,11 +55,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             text, add_arguments, _ = OTHERS[name]
             add_arguments(commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}."))
+    return parser, commands.choices
+
+
+@ending_with_its_reader()
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line and run the command.
+
+    :param argv: arguments, those of the process if None
+    :return: exit status
+    """
+    modules = command_modules()
+    parser, commands = command_line(modules)
     parsed, unknown = parser.parse_known_args(argv)
     options = {name: value for name, value in vars(parsed).items() if value is not None}
     command = options.pop("command")
     if unknown:
-        commands.choices[command].error(f"unrecognized arguments: {' '.join(unknown)}.")
+        commands[command].error(f"unrecognized arguments: {' '.join(unknown)}.")
 
     # Torch's threads wait asleep: spinning costs a factor of ten where another program uses the other core, and saves a
     # tenth where none does. The variable is read when torch is imported.
@@ -74,16 +89,16 @@ def _demo_pixels_arguments(parser: argparse.ArgumentParser) -> None:
 def _methods_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
     parser.add_argument("--methods", nargs="+", help="which (default: all)")
-    parser.add_argument("--jobs", type=int, help="methods at a time (default: 2)")
+    parser.add_argument("--jobs", type=at_least(1), help="methods at a time (default: 2)")
     _small_run_arguments(parser)
 
 
 def _small_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", help="for example walker-walk (default: walker-stand)")
-    parser.add_argument("--seed", type=int)
-    parser.add_argument("--pretrain-frames", type=int)
-    parser.add_argument("--finetune-frames", type=int)
-    parser.add_argument("--episodes", type=int, help="evaluation episodes")
+    parser.add_argument("--seed", type=at_least(0))
+    parser.add_argument("--pretrain-frames", type=at_least(0))
+    parser.add_argument("--finetune-frames", type=at_least(1))
+    parser.add_argument("--episodes", type=at_least(1), help="evaluation episodes")
     parser.add_argument("--preset", help="of the model (default: small)")
 
 

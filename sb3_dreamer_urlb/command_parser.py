@@ -4,10 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from sb3_dreamer_urlb.unknown_names import did_you_mean
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """The type of an option that counts something, or seeds it.
+
+    :param least: smallest value
+    """
+
+    def integer(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least:
+            raise argparse.ArgumentTypeError(f"must be an integer of at least {least}, got {text!r}.")
+        return value
+
+    return integer
 
 
 class CommandParser(argparse.ArgumentParser):

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb.command_parser import at_least
+
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,9 +22,9 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("--env", required=True, help="id of the environment, such as urlb/walker-run-v0")
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
-    parser.add_argument("--episodes", type=int, default=10, help="(default: %(default)s)")
-    parser.add_argument("--envs", type=int, help="environments at a time (default: as many as episodes, at most 10)")
-    parser.add_argument("--seed", type=int, default=1000, help="of the first episode (default: %(default)s)")
+    parser.add_argument("--episodes", type=at_least(1), default=10, help="(default: %(default)s)")
+    parser.add_argument("--envs", type=at_least(1), help="environments at a time (default: as many as episodes, at most 10)")
+    parser.add_argument("--seed", type=at_least(0), default=1000, help="of the first episode (default: %(default)s)")
 
 
 def add_statistics_argument(parser: argparse.ArgumentParser, whose: str = "") -> None:
@@ -43,14 +45,8 @@ def environments_at_a_time(options: dict[str, Any]) -> int:
     """How many environments to play the episodes in.
 
     :param options: of the command line
-    :raises ValueError: for a number of episodes or environments that is not positive
     """
-    from sb3_dreamer_urlb.number_checks import check_integer
-
-    check_integer("--episodes", options["episodes"], 1)
-    envs: int = options.get("envs", min(options["episodes"], 10))
-    check_integer("--envs", envs, 1)
-    return envs
+    return int(options.get("envs", min(options["episodes"], 10)))
 
 
 def load_agent(options: dict[str, Any], envs: int, **arguments: Any) -> tuple[Any, VecEnv]:

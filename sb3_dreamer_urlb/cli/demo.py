@@ -9,6 +9,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.command_parser import at_least
+
 HELP = "learn a walker task with and without pre-training, side by side, and show the difference"
 
 
@@ -18,12 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_output)")
     parser.add_argument("--task", help="of the walker: flip, run, walk, stand (default: flip)")
-    parser.add_argument("--seed", type=int, help="of everything random (default: 0)")
-    parser.add_argument("--finetune-frames", type=int, help="frames that each agent learns from (default: 20000)")
+    parser.add_argument("--seed", type=at_least(0), help="of everything random (default: 0)")
+    parser.add_argument("--finetune-frames", type=at_least(1), help="frames that each agent learns from (default: 20000)")
     parser.add_argument(
-        "--pretrain-frames", type=int, help="pre-train an agent now, for so many frames (40000 made the one that ships)"
+        "--pretrain-frames",
+        type=at_least(1),
+        help="pre-train an agent now, for so many frames (40000 made the one that ships)",
     )
-    parser.add_argument("--episodes", type=int, help="evaluation episodes (default: 10)")
+    parser.add_argument("--episodes", type=at_least(1), help="evaluation episodes (default: 10)")
 
 
 def run(options: dict[str, Any]) -> int:

@@ -15,6 +15,7 @@ from sb3_dreamer_urlb.cli.agents import (
     typed,
 )
 from sb3_dreamer_urlb.folders import made_folder
+from sb3_dreamer_urlb.phases import PRETRAINING
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.episodes import Evaluation
@@ -54,6 +55,8 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
 
+    if "set" in options and "rows" not in options:
+        raise ValueError("--set is about the row: it needs --rows FILE.")
     envs = environments_at_a_time(options)
     about = {"snapshot": options["snapshot"], **_columns(options.get("set", ()))}
     if "rows" in options:
@@ -64,6 +67,8 @@ def run(options: dict[str, Any]) -> int:
     if "rows" in options and model.seed is None and "seed" not in about:
         env.close()
         raise ValueError("The model has no seed, and rows tell runs apart by it: --set seed=...")
+    if model.phase == PRETRAINING:
+        print(f"The agent is still exploring ({model.phase_frames} frames of pre-training): it seeks no reward of a task.")
     planner = options["planner"]
     both = ("off",) if getattr(model, "planner", None) is None else ("on", "off")
     plan = both if planner == BOTH else (planner,)

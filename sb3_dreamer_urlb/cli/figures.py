@@ -12,6 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_dreamer_urlb.command_parser import at_least
 from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--also-method", nargs="+", default=[], help="methods from outside the package")
     parser.add_argument("--also-task", nargs="+", default=[], help="tasks from outside the benchmark, <domain>-<task>")
-    parser.add_argument("--repetitions", type=int, default=2000, help="of the bootstrap (default: %(default)s)")
+    parser.add_argument("--repetitions", type=at_least(1), default=2000, help="of the bootstrap (default: %(default)s)")
 
 
 def run(options: dict[str, Any]) -> int:
@@ -62,7 +63,6 @@ def run(options: dict[str, Any]) -> int:
 
     check_matplotlib_installed()
     check_rliable_installed()
-    check_integer("--repetitions", options["repetitions"], 1)
     if options["out"].exists() and not options["out"].is_dir():
         raise ValueError(f"--out {options['out']} is a file: give a folder.")
     try:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.cli.agents import add_statistics_argument
+from sb3_dreamer_urlb.command_parser import at_least
 
 HELP = "measure whether fine-tuning should keep the pre-trained actor"
 
@@ -18,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("snapshot", type=Path, help="pre-trained")
     parser.add_argument("--env", required=True, help="id of the task's environment, such as urlb/walker-run-v0")
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
-    parser.add_argument("--episodes", type=int, default=5, help="with each actor (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=3000, help="of the first episode (default: %(default)s)")
+    parser.add_argument("--episodes", type=at_least(1), default=5, help="with each actor (default: %(default)s)")
+    parser.add_argument("--seed", type=at_least(0), default=3000, help="of the first episode (default: %(default)s)")
     add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
@@ -36,10 +37,8 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.analysis.actor_trial import try_actor
     from sb3_dreamer_urlb.cli.agents import load_agent
     from sb3_dreamer_urlb.evaluation.names import counted
-    from sb3_dreamer_urlb.number_checks import check_integer
     from sb3_dreamer_urlb.transfer_rule import keeps_actor
 
-    check_integer("--episodes", options["episodes"], 1)
     model, env = load_agent(options, min(options["episodes"], 10))
     try:
         trial = try_actor(model, env, options["episodes"], options["seed"])

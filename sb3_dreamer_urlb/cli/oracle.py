@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb.cli.agents import add_statistics_argument
+from sb3_dreamer_urlb.command_parser import at_least
 from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ def add_oracle_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trajectories", type=Path, help="folder of recorded episodes; with --oracle they are written there")
     add_statistics_argument(parser)
     add_statistics_argument(parser, "oracle")
-    parser.add_argument("--count", type=int, default=30, help="trajectories (default: %(default)s, the paper's)")
-    parser.add_argument("--seed", type=int, default=2000, help="of the first trajectory (default: %(default)s)")
+    parser.add_argument("--count", type=at_least(1), default=30, help="trajectories (default: %(default)s, the paper's)")
+    parser.add_argument("--seed", type=at_least(0), default=2000, help="of the first trajectory (default: %(default)s)")
     parser.add_argument("--rows", type=Path, help="CSV file of evaluations: the number is written beside this agent's")
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
@@ -37,10 +38,7 @@ def check_oracle_options(options: dict[str, Any]) -> None:
     :raises OSError: if something is not there, or cannot be written
     """
     from sb3_dreamer_urlb.evaluation.append import check_can_append
-    from sb3_dreamer_urlb.number_checks import check_integer
 
-    check_integer("--count", options["count"], 1)
-    check_integer("--seed", options["seed"], 0)
     if "oracle" not in options and "trajectories" not in options:
         raise ValueError("Give --oracle, a snapshot that plays, or --trajectories, a folder of recorded episodes.")
     if "oracle" in options and "trajectories" in options:

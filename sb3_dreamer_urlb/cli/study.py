@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.command_parser import at_least
+
 HELP = "list the runs of one of the paper's ablations, and do those that are missing"
 #: options that change the paper's plan
 PLANNED = ("methods", "tasks", "seeds", "pretrain_frames", "finetune_frames")
@@ -22,10 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--methods", nargs="+", help="intrinsic rewards (default: the paper's)")
     parser.add_argument("--tasks", nargs="+", help="such as walker-run (default: the paper's)")
     parser.add_argument("--scratch", action="store_true", help="beside it, agents that learn each task without pre-training")
-    parser.add_argument("--seeds", type=int, help="how many (default: 3)")
-    parser.add_argument("--pretrain-frames", type=int, nargs="+", help="lengths of the pre-training (default: the paper's)")
-    parser.add_argument("--finetune-frames", type=int, help="(default: 100000)")
-    parser.add_argument("--episodes", type=int, default=10, help="of an evaluation (default: %(default)s)")
+    parser.add_argument("--seeds", type=at_least(1), help="how many (default: 3)")
+    parser.add_argument(
+        "--pretrain-frames", type=at_least(1), nargs="+", help="lengths of the pre-training (default: the paper's)"
+    )
+    parser.add_argument("--finetune-frames", type=at_least(1), help="(default: 100000)")
+    parser.add_argument("--episodes", type=at_least(1), default=10, help="of an evaluation (default: %(default)s)")
     parser.add_argument("--preset", default="paper", help="of the models (default: %(default)s)")
     choices = ("pixels", "state")
     parser.add_argument(
@@ -35,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="state: normalised, with --preset state-small (default: pixels)",
     )
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after so many")
-    parser.add_argument("--at-most", type=int, help="fine-tunings")
+    parser.add_argument("--at-most", type=at_least(1), help="fine-tunings")
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 
@@ -54,11 +58,7 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.devices import known_device
     from sb3_dreamer_urlb.dreamer_v2.presets import get_preset
     from sb3_dreamer_urlb.intrinsic import make_intrinsic_reward
-    from sb3_dreamer_urlb.number_checks import check_integer
 
-    check_integer("--episodes", options["episodes"], 1)
-    if "at_most" in options:
-        check_integer("--at-most", options["at_most"], 1)
     if not options["minutes"] > 0:
         raise ValueError(f"--minutes must be more than 0, got {options['minutes']}.")
     known_device(options["device"], "--device")

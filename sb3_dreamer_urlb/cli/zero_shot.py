@@ -13,6 +13,7 @@ from sb3_dreamer_urlb.cli.agents import (
     environments_at_a_time,
     load_agent,
 )
+from sb3_dreamer_urlb.command_parser import at_least
 from sb3_dreamer_urlb.folders import check_file
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the paper's numbers, or the snapshot's own, for small machines (default: %(default)s)",
     )
     parser.add_argument(
-        "--finetune-frames", type=int, default=0, help="then fine-tune so long, and evaluate again (paper: 100000)"
+        "--finetune-frames", type=at_least(0), default=0, help="then fine-tune so long, and evaluate again (paper: 100000)"
     )
     parser.add_argument("--freeze-decoder", action="store_true", help="while fine-tuning, for the latent dynamics discrepancy")
     parser.add_argument("--save", type=Path, help="snapshot of the fine-tuned model")
@@ -55,10 +56,8 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
     from sb3_dreamer_urlb.evaluation.names import counted
-    from sb3_dreamer_urlb.number_checks import check_integer
 
     envs = environments_at_a_time(options)
-    check_integer("--finetune-frames", options["finetune_frames"], 0)
     if options["finetune_frames"] == 0 and (options["freeze_decoder"] or "save" in options):
         raise ValueError("--freeze-decoder and --save need --finetune-frames.")
     if "rows" in options:

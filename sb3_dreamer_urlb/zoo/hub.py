@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.command_parser import CommandParser
+from sb3_dreamer_urlb.command_parser import CommandParser, at_least
 from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.hub.package import STATISTICS, load_from_hub, name_of_model, package_to_hub
 from sb3_dreamer_urlb.hub.privacy import as_plain, plain_for_everybody
@@ -44,15 +44,15 @@ def push(argv: Sequence[str], prog: str) -> str:
     parser = _parser(prog, "Put a trained model on the Hugging Face Hub, or into a folder.")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="the best model of the evaluations")
-    which.add_argument("--load-checkpoint", type=int, help="a checkpoint, by its number of steps")
+    which.add_argument("--load-checkpoint", type=at_least(0), help="a checkpoint, by its number of steps")
     which.add_argument("--load-last-checkpoint", action="store_true")
     parser.add_argument("-m", "--commit-message", help="(default: names the algorithm)")
-    parser.add_argument("-n", "--n-timesteps", type=int, default=500, help="agent steps of the film (default: 500)")
+    parser.add_argument("-n", "--n-timesteps", type=at_least(1), default=500, help="agent steps of the film (default: 500)")
     parser.add_argument("--no-render", action="store_true", help="no film")
-    parser.add_argument("--n-eval-episodes", type=int, default=10)
+    parser.add_argument("--n-eval-episodes", type=at_least(1), default=10)
     parser.add_argument("--stochastic", action="store_true", help="evaluate with exploration")
     parser.add_argument("--deterministic", action="store_true", help="the default")
-    parser.add_argument("--seed", type=int, default=0, help="of the evaluation's environment")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="of the evaluation's environment")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--private", action="store_true", help="make the repository private where it has to be made")
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, help="further arguments of the environment")
@@ -171,8 +171,8 @@ def _parser(prog: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--algo", default="dreamerv2", choices=sorted(ALGORITHMS))
     parser.add_argument("-orga", "--organization", required=True, help="user or organisation; or a folder: ./path, /path")
     parser.add_argument("-name", "--repo-name", help="of the repository (default: the algorithm and the environment)")
-    parser.add_argument("--exp-id", type=int, default=0, help="number of the run (0: the latest, or a new one)")
-    parser.add_argument("--verbose", type=int, default=1, help="accepted as in rl_zoo3")
+    parser.add_argument("--exp-id", type=at_least(0), default=0, help="number of the run (0: the latest, or a new one)")
+    parser.add_argument("--verbose", type=at_least(0), default=1, help="accepted as in rl_zoo3")
     return parser
 
 

@@ -21,8 +21,8 @@ from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 
 #: what Python says of arguments that a function does not have, or lacks
 SIGNATURE = ("got an unexpected keyword argument", "missing 1 required", "required positional argument")
-#: options of rl_zoo3's that count what there must be one of
-COUNTS = {"n_envs", "n_eval_envs", "eval_episodes"}
+#: options of rl_zoo3's that count or seed something → the least they may be; but for their defaults, which say: not given
+LEAST = {"n_envs": 1, "n_eval_envs": 1, "eval_episodes": 1, "n_jobs": 1, "n_timesteps": 1, "num_threads": 1, "seed": 0}
 #: folders that this process has made for a run, each with those around it that it has made, too, from within
 NEW_FOLDERS: list[list[Path]] = []
 
@@ -124,9 +124,11 @@ def with_values_named(parse: Callable[..., argparse.Namespace]) -> Callable[...,
                 f"{type(error).__name__}: {error}. Values of -params and of environments' arguments are Python, in which text "
                 "has quotation marks: \"preset:'tiny'\""
             )
-        for name in COUNTS & vars(options).keys():
-            if (count := getattr(options, name)) < 1:
-                parser.error(f"--{name.replace('_', '-')} must be at least 1, got {count}.")
+        for name in LEAST.keys() & vars(options).keys():
+            number = getattr(options, name)
+            if number < LEAST[name] and number != parser.get_default(name):
+                option = next("/".join(action.option_strings) for action in parser._actions if action.dest == name)
+                parser.error(f"{option} must be at least {LEAST[name]}, got {number}.")
         return options
 
     return parse_args

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from sb3_dreamer_urlb.command_parser import at_least
 from sb3_dreamer_urlb.folders import check_file, made_folder
 from sb3_dreamer_urlb.words import counted
 from sb3_dreamer_urlb.zoo.found_runs import check_there_are_runs
@@ -67,7 +68,7 @@ def _understood(arguments: list[str], prog: str) -> tuple[argparse.Namespace, li
     """
     parser = argparse.ArgumentParser(prog=prog, add_help=False)
     parser.add_argument("--output")
-    parser.add_argument("-w", "--episode-window", type=int, default=100)
+    parser.add_argument("-w", "--episode-window", type=at_least(1), default=100)
     parser.add_argument("-a", "--algo")
     parser.add_argument("-e", "--env", nargs="+")
     parser.add_argument("-f", "--exp-folder")
@@ -78,8 +79,6 @@ def _understood(arguments: list[str], prog: str) -> tuple[argparse.Namespace, li
     for option, given in (("--algo", own.algo), ("--exp-folder", own.exp_folder), ("--env", envs)):
         if given:
             rest += [option, *([given] if isinstance(given, str) else given)]
-    if own.episode_window < 1:
-        parser.error(f"--episode-window must be at least 1, got {own.episode_window}.")
     if own.output:
         try:
             check_file("--output", own.output)

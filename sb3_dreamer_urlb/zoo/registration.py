@@ -76,8 +76,6 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     """
     known_device(manager.device, "--device")
     options = manager.args
-    if (steps := getattr(options, "n_timesteps", -1)) != -1:  # rl_zoo3's for none
-        hyperparameters.check_steps("-n", steps)
     run = resuming.run_at(getattr(options, "run_folder", "") or manager.trained_agent)
     given, manager.env_kwargs = manager.env_kwargs, {}  # rl_zoo3 would forget the configuration's
     if run is not None and getattr(options, "conf_file", manager.config) is None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sb3_dreamer_urlb.__main__ import MODULES, OTHERS, main
+from sb3_dreamer_urlb.__main__ import MODULES, OTHERS, command_line, command_modules, main
+from sb3_dreamer_urlb.command_parser import at_least
 from sb3_dreamer_urlb.zoo.__main__ import main as zoo
 
 COMMANDS = sorted({name.replace("_", "-") for name in MODULES} | set(OTHERS))
@@ -64,6 +68,31 @@ def test_what_lacks_only_because_it_is_misspelt_is_told_so(capsys, arguments, wh
         main(arguments)
     last = capsys.readouterr().err.splitlines(keepends=True)[-1]
     assert last.startswith(f"sb3-dreamer-urlb{whose}: error: ") and message in last
+
+
+def test_every_number_of_every_command_has_its_least_value():
+    commands = command_line(command_modules())[1]
+    for name, command in commands.items():
+        for action in command._actions:
+            assert action.type is not int, (name, action.option_strings)
+    assert sum(action.type.__qualname__.startswith("at_least") for one in commands.values() for action in one._actions
+               if action.type is not None) > 20  # fmt: skip
+
+
+@pytest.mark.parametrize("least", [0, 1])
+@given(value=st.integers(-9) | st.floats() | st.sampled_from(["", "many", "1e3", None]))
+def test_a_number_below_its_least_or_none_at_all_is_refused(least, value):
+    text = str(value)
+    if isinstance(value, int) and value >= least:
+        assert at_least(least)(text) == value
+    else:
+        with pytest.raises(argparse.ArgumentTypeError, match=f"must be an integer of at least {least}, got "):
+            at_least(least)(text)
+
+
+def test_columns_without_a_row_are_refused_before_anything_is_read(capsys):
+    assert main(["evaluate", "no.zip", "--env", "walker", "--set", "arm=mine"]) == 2
+    assert capsys.readouterr().err == "sb3-dreamer-urlb: --set is about the row: it needs --rows FILE.\n"
 
 
 def test_commands_for_the_zoo_are_answered_likewise(capsys):

@@ -112,14 +112,17 @@ def test_less_than_an_episode_is_enough(fake_walker, tmp_path, capsys):
     assert (tmp_path / "report.html").exists() and "mean return of 1 episode\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--finetune-frames", "-5000"]])
+@pytest.mark.parametrize("number", [{"episodes": 0}, {"finetune_frames": -5000}])
 @pytest.mark.filterwarnings("ignore")
-def test_numbers_that_make_no_sense_are_refused_at_once(fake_walker, tmp_path, monkeypatch, arguments):
+def test_numbers_that_make_no_sense_are_refused_at_once(fake_walker, tmp_path, monkeypatch, number):
     monkeypatch.setattr(demo_pixels, "_train", lambda *_: pytest.fail("it trained"))
-    assert __main__.main(["demo-pixels", "--out", str(tmp_path / "out"), "--preset", "tiny", *arguments]) == 2
+    with pytest.raises(ValueError, match=f"got {next(iter(number.values()))}|{next(iter(number))}"):
+        demo_pixels.run_demo(demo_pixels.DemoConfig(out=tmp_path / "out", preset="tiny", **number))
 
 
-@pytest.mark.parametrize("arguments", [[], ["play"], ["demo-pixels", "--seed", "x"]])
+@pytest.mark.parametrize(
+    "arguments", [[], ["play"], ["demo-pixels", "--seed", "x"], ["demo-pixels", "--episodes", "0"], ["demo", "--seed", "-1"]]
+)
 def test_a_wrong_command_line_is_refused(arguments, capsys):
     with pytest.raises(SystemExit) as error:
         __main__.main(arguments)

@@ -98,7 +98,6 @@ def test_an_interruption_costs_a_line(args, line, capsys):
         ("study modules list --folder {folder} --methods lbs --preset nope", "Unknown preset 'nope'"),
         ("study modules list --folder {folder} --methods lbs --device foo", "--device must be"),
         ("study modules run --folder {folder} --methods lbs --minutes nan", "--minutes must be more than 0"),
-        ("study modules run --folder {folder} --methods lbs --at-most -1", "--at-most must be an integer of at least 1"),
         ("study modules run --folder {folder} --methods lbs random", "keeps pre-trained actors: random trains none"),
         ("study sparsity list --folder {folder} --methods random", "keeps pre-trained actors: random trains none"),
     ],

@@ -285,7 +285,7 @@ def test_mistakes_are_named(zoo, monkeypatch, capsys):
 @pytest.mark.parametrize("steps", ["0", "-5"])
 def test_a_run_of_no_steps_is_refused(zoo, capsys, steps):
     line = refused(capsys, zoo, *TRAIN, "--env", STAND, "-conf", "lbs", f"-n={steps}", "-params", *TINY)
-    assert f"-n must be a positive number of agent steps, got {steps}" in line
+    assert f"-n/--n-timesteps must be at least 1, got {steps}" in line
 
 
 def test_the_command_of_a_run_can_be_pasted_into_a_shell(zoo, monkeypatch):
@@ -421,6 +421,8 @@ def test_a_start_that_is_refused_leaves_no_folder(zoo, capsys, there):
     [
         (("--eval-freq", "8", "--eval-episodes", "0"), "--eval-episodes must be at least 1, got 0."),
         (("--eval-freq", "8", "--n-eval-envs", "0"), "--n-eval-envs must be at least 1, got 0."),
+        (("--seed", "-7"), "--seed must be at least 0, got -7."),
+        (("--num-threads", "-3"), "--num-threads must be at least 1, got -3."),
         (("-i", "own.yml"), "valid path to a .zip file"),
     ],
 )
@@ -435,7 +437,7 @@ def test_options_that_rl_zoo3_does_not_check_are_refused(zoo, capsys, options, m
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("-w", "0", "--output", "a.png"), "--episode-window must be at least 1, got 0."),
+        (("-w", "0", "--output", "a.png"), "--episode-window: must be an integer of at least 1, got '0'."),
         (("--output", "."), "--output must be the path of a file, got '.': that is a folder."),
     ],
 )
