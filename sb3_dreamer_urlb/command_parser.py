@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -26,6 +27,20 @@ def at_least(least: int) -> Callable[[str], int]:
         return value
 
     return integer
+
+
+def with_near_choices(message: str) -> str:
+    """argparse's message about a value that is none of an option's choices, with near ones at its end; others as they are.
+
+    :param message: of ``ArgumentParser.error``
+    """
+    found = re.search(r"invalid choice: (.+) \(choose from (.+)\)", message)
+    if found is None:
+        return message
+    # Quoted until Python 3.11, in some later versions not.
+    value, *choices = (text.strip("'\"") for text in (found[1], *found[2].split(", ")))
+    near = did_you_mean([value], choices)
+    return message.rstrip(".") + "." + near if near else message
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -52,7 +67,7 @@ class CommandParser(argparse.ArgumentParser):
         # The beginning of an option is taken for it.
         wrong = [name for name in wrong if not any(option.startswith(name) for option in options)]
         near = did_you_mean(wrong, options) or did_you_mean(self._wrong_command(), self._commands())
-        super().error(message.rstrip(".") + "." + near if near else message)
+        super().error(message.rstrip(".") + "." + near if near else with_near_choices(message))
 
     def _commands(self) -> list[str]:
         actions = self._get_positional_actions()

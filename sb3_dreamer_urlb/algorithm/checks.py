@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.normalized import hides_originals
+from sb3_dreamer_urlb.envs.registration import naming_near_ids
 from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
@@ -91,7 +92,8 @@ def given_env(env: Any, argument: str = "env") -> GymEnv:
     """
     if not isinstance(env, str) and not hasattr(env, "step"):
         raise ValueError(f"{argument} must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
-    env = maybe_make_env(env, 0)
+    with naming_near_ids(str(env)):
+        env = maybe_make_env(env, 0)
     if isinstance(env, gymnasium.vector.VectorEnv):
         raise ValueError(
             f"{argument} is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 "

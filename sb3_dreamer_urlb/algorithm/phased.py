@@ -20,6 +20,7 @@ from sb3_dreamer_urlb.algorithm.updates_due import UpdatesDue
 from sb3_dreamer_urlb.devices import chosen_device
 from sb3_dreamer_urlb.envs import broken_rules
 from sb3_dreamer_urlb.envs.faults import EnvironmentFaultError
+from sb3_dreamer_urlb.envs.registration import naming_near_ids
 from sb3_dreamer_urlb.intrinsic import ExplorationMethod
 from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, UpdateGuard
 from sb3_dreamer_urlb.number_checks import check_dict, plain
@@ -72,7 +73,8 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
         for name in ("policy_kwargs", "replay_buffer_kwargs"):
             # Stable-Baselines3 takes whatever is false for an empty one.
             check_dict(name, kwargs.get(name))
-        super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
+        with naming_near_ids(str(env)):
+            super().__init__(policy, env, learning_rate, verbose=verbose, support_multi_env=True, sde_support=False, **kwargs)
         self.intrinsic_reward = intrinsic_reward
         self.overlap = overlap
         self.preset = preset

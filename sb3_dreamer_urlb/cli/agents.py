@@ -93,12 +93,14 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
     """
     from stable_baselines3.common.env_util import make_vec_env
 
+    from sb3_dreamer_urlb.envs.registration import naming_near_ids
     from sb3_dreamer_urlb.evaluation.loading import normalized_as_saved
     from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 
     kwargs = {name: typed(value) for name, value in pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
     snapshot = _file(options["snapshot"])
-    env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
+    with naming_near_ids(options["env"]):
+        env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
     try:
         statistics = options.get("vec_normalize") or (beside(snapshot) if beside(snapshot).is_file() else None)
         with _hinting_at_states(env):

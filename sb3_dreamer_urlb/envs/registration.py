@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import gymnasium
 
 from sb3_dreamer_urlb.envs.options import check_choice
 from sb3_dreamer_urlb.envs.perturbations import LEVELS
+from sb3_dreamer_urlb.unknown_names import did_you_mean
 
 #: The three domains with four tasks each (URLB, Laskin et al. 2021).
 URLB_TASKS: dict[str, tuple[str, ...]] = {
@@ -91,6 +95,20 @@ def id_meaning(wanted: dict[str, str]) -> str | None:
     :param wanted: as :func:`meant_by` gives it
     """
     return next((name for name, meant in _MEANT.items() if meant == wanted), None)
+
+
+@contextmanager
+def naming_near_ids(name: str) -> Iterator[None]:
+    """Where Gymnasium does not know an id and has no near one in its namespace, its error names those of all.
+
+    :param name: the id
+    """
+    try:
+        yield
+    except gymnasium.error.UnregisteredEnv as error:
+        if "did you mean" not in str(error).lower():
+            error.args = (str(error) + did_you_mean([name], gymnasium.registry),)
+        raise
 
 
 def register_envs() -> None:

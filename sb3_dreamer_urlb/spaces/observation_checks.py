@@ -57,7 +57,7 @@ def _array(name: str, value: Any, space: spaces.Space[Any]) -> np.ndarray:
 
 
 def check_classes(name: str, observation: Any, space: spaces.Space[Any]) -> None:
-    """Whether choices are among those of their space: torch would only say that an index is out of bounds.
+    """Whether choices are among those of their space: torch would only say that an index is out of bounds, or round them.
 
     :param name: of the observation, which begins the message
     :param observation: array of one environment or with a leading n; or several by name
@@ -68,13 +68,17 @@ def check_classes(name: str, observation: Any, space: spaces.Space[Any]) -> None
         for part, its in space.spaces.items():
             if part in observation:
                 check_classes(f"{name} {part!r}", observation[part], its)
-    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return
     array = np.asarray(observation)
-    least, count = (space.start, space.n) if isinstance(space, spaces.Discrete) else (space.start, space.nvec)
+    least, count = (0, 2) if isinstance(space, spaces.MultiBinary) else (space.start, _counts(space))
     wrong_shape = array.ndim < len(space.shape or ()) or (space.shape and array.shape[-len(space.shape) :] != space.shape)
-    if not wrong_shape and not ((array >= least) & (array < least + count)).all():
+    if not wrong_shape and not ((array >= least) & (array < least + count) & (array == np.floor(array))).all():
         raise ValueError(f"{name} must be in {space}, got {_numbers(array)}.")
+
+
+def _counts(space: spaces.Discrete | spaces.MultiDiscrete) -> Any:
+    return space.n if isinstance(space, spaces.Discrete) else space.nvec
 
 
 def _numbers(array: np.ndarray) -> str:

@@ -8,9 +8,11 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import gymnasium
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import sb3_dreamer_urlb
 from sb3_dreamer_urlb.callbacks.checkpoint import RunCheckpointCallback
@@ -25,8 +27,12 @@ OWN_KEYS = (
 )
 #: those of them that count something
 WHOLE_NUMBERS = {"n_envs", "frame_stack"}
-#: those that name classes, and what these are given without being asked
-CLASSES = {"callback": (), "env_wrapper": ("env",), "vec_env_wrapper": ("venv",)}
+#: those that name classes, what these are given without being asked, and what they are
+CLASSES: dict[str, tuple[tuple[str, ...], type]] = {
+    "callback": ((), BaseCallback),
+    "env_wrapper": (("env",), gymnasium.Env),
+    "vec_env_wrapper": (("venv",), VecEnv),
+}
 #: arguments that rl_zoo3 hands over itself, from options of the same names
 OF_THE_COMMAND_LINE = {"env", "seed", "device", "verbose", "tensorboard_log"}
 #: keys whose values are nobody's to judge
@@ -59,8 +65,8 @@ def check(hyperparams: dict[str, Any], algorithm: str, arguments: Iterable[str])
     check_steps("n_timesteps", hyperparams.get("n_timesteps", 1))
     for name in WHOLE_NUMBERS & set(hyperparams):
         check_integer(name, hyperparams[name], 1)
-    for key, filled_in in CLASSES.items():
-        _check_classes(key, hyperparams.get(key), filled_in)
+    for key in CLASSES:
+        _check_classes(key, hyperparams.get(key))
     _check_normalize(hyperparams.get("normalize"))
     policy = hyperparams.get("policy", "")
     if not isinstance(policy, str | type):
@@ -87,6 +93,9 @@ def check_evaluated(normalize: Any, monitor_kwargs: Any) -> None:
         if not isinstance(given, dict):
             raise ValueError(f"{key} must be keyword arguments of {kind.__name__}, got {given!r}.")
         check_keys(key, given, named_parameters(kind).keys() - filled_in)
+    names = monitor_kwargs.get("info_keywords", ())
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"monitor_kwargs: info_keywords must be a list of names, got {names!r}.")
 
 
 def _check_normalize(normalize: Any) -> None:
@@ -136,7 +145,8 @@ def _for_yaml(text: str) -> str:
     return np.format_float_scientific(number, trim="0", exp_digits=1)
 
 
-def _check_classes(key: str, entries: Any, filled_in: Iterable[str]) -> None:
+def _check_classes(key: str, entries: Any) -> None:
+    filled_in, base = CLASSES[key]
     for entry in entries if isinstance(entries, list) else [] if entries is None else [entries]:
         name: Any = entry
         kwargs: Any = {}
@@ -154,6 +164,9 @@ def _check_classes(key: str, entries: Any, filled_in: Iterable[str]) -> None:
         if not isinstance(kwargs, dict):
             raise ValueError(f"{key}: expected arguments of {getattr(name, '__name__', name)} by name, got {kwargs!r}.")
         if isinstance(name, type):
+            # A function may make whatever it likes.
+            if not issubclass(name, base):
+                raise ValueError(f"{key}: expected a subclass of {base.__name__}, got {name.__module__}.{name.__name__}.")
             check_keywords(name, kwargs, filled_in)
 
 

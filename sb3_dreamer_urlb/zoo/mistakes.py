@@ -17,6 +17,7 @@ from stable_baselines3.common import utils
 from stable_baselines3.common.logger import Logger
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.command_parser import with_near_choices
 from sb3_dreamer_urlb.mistakes import is_a_mistake, tell
 
 #: what Python says of arguments that a function does not have, or lacks
@@ -141,4 +142,4 @@ def error_in_a_line(parser: argparse.ArgumentParser, message: str) -> NoReturn:
     :param message: what was wrong
     :raises SystemExit: 2
     """
-    parser.exit(2, f"{parser.prog}: error: {message} ({parser.prog} --help lists the options)\n")
+    parser.exit(2, f"{parser.prog}: error: {with_near_choices(message)} ({parser.prog} --help lists the options)\n")

@@ -104,6 +104,9 @@ def with_runs(parse: Callable[..., argparse.Namespace]) -> Callable[..., argpars
             parser.error(str(error))
         if run is None:
             return options
+        if "algo" not in before:
+            models = ", ".join(map(str, sorted(run.glob("*.zip"))))
+            parser.error(f"{run} holds a model that was fetched, not a run that can go on: -i {models} begins with it")
         known = vars(options).keys() - {*OTHER}
         parser.set_defaults(**{name: value for name, value in before.items() if name in known})
         options = parse(parser, args, namespace)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gymnasium
 import pytest
+from fake_envs import CounterEnv
 
 from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback
+from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.evaluation.recording import env_to_play_in
 
 ENV = "CartPole-v1"
@@ -72,3 +75,25 @@ def test_an_id_to_play_in(stage):
 def test_what_is_no_environment_to_play_in(stage):
     with pytest.raises(ValueError, match="eval_env must be an environment of Gymnasium, a VecEnv or an id, got 3"):
         stage(tiny(), 3)
+
+
+@pytest.mark.parametrize("wrong", ["walker-run", "walker_run", "walker-Run-v0"])
+def test_an_id_without_its_namespace_is_answered_with_the_one_that_has_it(wrong, tmp_path, capsys):
+    near = r"Did you mean .*'urlb/walker-run-v0'"
+    with pytest.raises(gymnasium.error.UnregisteredEnv, match=near):
+        DreamerV2("CnnPolicy", wrong, preset="tiny")
+    model = DreamerV2("CnnPolicy", CounterEnv(), preset="tiny")
+    with pytest.raises(gymnasium.error.UnregisteredEnv, match=near):
+        model.set_env(wrong)
+    model.save(tmp_path / "model.zip")
+    assert main(["evaluate", str(tmp_path / "model.zip"), "--env", wrong]) == 2
+    assert "'urlb/walker-run-v0'" in capsys.readouterr().err
+
+
+def test_what_gymnasium_answers_itself_stays(tiny_model):
+    with pytest.raises(gymnasium.error.NameNotFound, match="CartPole") as error:
+        tiny_model("CartPol-v1")
+    assert str(error.value).lower().count("did you mean") == 1
+    with pytest.raises(gymnasium.error.NameNotFound, match="qqqq") as error:
+        tiny_model("qqqq")
+    assert "did you mean" not in str(error.value).lower()

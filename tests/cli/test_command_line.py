@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_dreamer_urlb.__main__ import MODULES, OTHERS, command_line, command_modules, main
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import at_least, with_near_choices
 from sb3_dreamer_urlb.zoo.__main__ import main as zoo
 
 COMMANDS = sorted({name.replace("_", "-") for name in MODULES} | set(OTHERS))
@@ -93,6 +93,25 @@ def test_a_number_below_its_least_or_none_at_all_is_refused(least, value):
 def test_columns_without_a_row_are_refused_before_anything_is_read(capsys):
     assert main(["evaluate", "no.zip", "--env", "walker", "--set", "arm=mine"]) == 2
     assert capsys.readouterr().err == "sb3-dreamer-urlb: --set is about the row: it needs --rows FILE.\n"
+
+
+@pytest.mark.parametrize(
+    ("message", "end"),
+    [
+        ("argument --algo: invalid choice: 'dreamer_v2' (choose from 'sac', 'dreamerv2')", ". Did you mean 'dreamerv2'?"),
+        ("argument --algo: invalid choice: 'dreamer_v2' (choose from sac, dreamerv2)", ". Did you mean 'dreamerv2'?"),
+        ("argument --algo: invalid choice: 'x' (choose from sac, dreamerv2)", ""),
+        ("the following arguments are required: --env", ""),
+    ],
+)
+def test_a_choice_that_is_none_is_answered_with_near_ones(message, end):
+    assert with_near_choices(message) == message + end
+
+
+def test_choices_of_an_option_are_answered_likewise(capsys):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["evaluate", "x", "--env", "y", "--planner", "of"])
+    assert capsys.readouterr().err.endswith("Did you mean 'off'?\n")
 
 
 def test_commands_for_the_zoo_are_answered_likewise(capsys):

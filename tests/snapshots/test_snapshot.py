@@ -25,6 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from places import ROOT
 from snapshot_files import change_data, change_header, code_events, members, write
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -646,6 +647,12 @@ def test_stable_baselines3s_own_form_is_refused_and_converted(old_form, tmp_path
     for more in ([], ["--trust"]):
         assert main(["convert", str(new), str(tmp_path / "newer"), *more]) == 2
     assert capsys.readouterr().err.count(f"{new} is in the safe form already.") == 2
+
+
+def test_models_of_other_algorithms_are_not_converted(tmp_path, capsys):
+    SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "sac.zip")
+    assert main(["convert", str(tmp_path / "sac.zip"), str(tmp_path / "new.zip"), "--trust"]) == 2
+    assert "sac.zip holds a model of stable_baselines3.sac.policies, not of DreamerV2." in capsys.readouterr().err
 
 
 def test_converting_what_is_none(saved, tmp_path, capsys):

@@ -355,6 +355,13 @@ SWITCH = "sb3_dreamer_urlb.PhaseSwitchCallback"
         ("noise_type:'normal'", "noise_type 'normal' needs noise_std"),
         ("callback:3", "callback: expected module.Class, got 3."),
         ("env_wrapper:[4.5]", "env_wrapper: expected module.Class, got 4.5."),
+        (
+            "env_wrapper:'stable_baselines3.common.vec_env.VecFrameStack'",
+            "env_wrapper: expected a subclass of Env, got",
+        ),
+        ("vec_env_wrapper:'gymnasium.wrappers.ClipAction'", "vec_env_wrapper: expected a subclass of VecEnv, got gymnasium"),
+        ("callback:'torch.nn.Linear'", "callback: expected a subclass of BaseCallback, got torch.nn.modules.linear.Linear."),
+        ("monitor_kwargs:dict(info_keywords=3)", "monitor_kwargs: info_keywords must be a list of names, got 3."),
         ("callback:'PhaseSwitchCallback'", f"expected module.Class, got 'PhaseSwitchCallback'. Did you mean '{SWITCH}'"),
         ("callback:'sb3_dreamer.PhaseSwitchCallback'", f"No module named 'sb3_dreamer'. Did you mean '{SWITCH}'"),
         ("callback:'nowhere.Callback'", "callback: nowhere.Callback cannot be imported: No module named 'nowhere'"),
@@ -670,6 +677,9 @@ def test_a_run_is_shared_and_played_elsewhere(zoo, capsys):
     capsys.readouterr()
     zoo("enjoy", "--algo", "dreamerv2", "--env", STAND, "-f", "elsewhere", "-n", "21", "--device", "cpu")
     assert "Mean reward: 10.0" in capsys.readouterr().out
+    fetched = "elsewhere/dreamerv2/urlb-walker-stand-v0_1"
+    line = refused(capsys, train, zoo, STAND, 8, "lbs", "-i", fetched, params=TINY)
+    assert f"-i {fetched}/urlb-walker-stand-v0.zip begins with it" in line
     # Another one beside it, or in its place.
     zoo("load_from_hub", *SHARE, "-f", "elsewhere")
     assert main(["load_from_hub", *SHARE, "-f", "elsewhere", "--exp-id", "2"]) == 2
