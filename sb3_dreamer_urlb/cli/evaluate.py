@@ -51,9 +51,10 @@ def run(options: dict[str, Any]) -> int:
     """
     import numpy as np
 
-    from sb3_dreamer_urlb.evaluation.agent_rows import CHANGED, env_columns, results_of, row_of
+    from sb3_dreamer_urlb.evaluation.agent_rows import env_columns, results_of, row_of
     from sb3_dreamer_urlb.evaluation.append import append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
+    from sb3_dreamer_urlb.evaluation.rows import CHANGED
 
     if "set" in options and "rows" not in options:
         raise ValueError("--set is about the row: it needs --rows FILE.")

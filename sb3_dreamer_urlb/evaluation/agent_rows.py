@@ -15,14 +15,12 @@ from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.told import CLASS
 from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 from sb3_dreamer_urlb.evaluation.names import columns_of_id
-from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row
+from sb3_dreamer_urlb.evaluation.rows import CHANGED, REQUIRED, Row
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.snapshots import values
 
 #: classes of algorithms → what a run of theirs without pre-training is called
 FROM_SCRATCH = {"DreamerV2": "dreamer", "DrQv2": "drqv2"}
-#: column of the arguments that make another task of an id; rows of the task as it is registered have none
-CHANGED = "environment"
 #: arguments of environments that other columns have
 IN_OTHER_COLUMNS = {"domain", "task", "observation"}
 PACKAGES = ("torch", "numpy", "gymnasium", "stable-baselines3", "dm-control", "mujoco")

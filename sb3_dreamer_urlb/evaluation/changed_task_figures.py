@@ -8,20 +8,19 @@ from sb3_dreamer_urlb.evaluation.aggregate import Estimate, mean_and_error
 from sb3_dreamer_urlb.evaluation.arms import Arm, Study, acts, any_task, kept, plans, scratch
 from sb3_dreamer_urlb.evaluation.figure_parts import after, is_method, normalized, seeds, split_by, unscored
 from sb3_dreamer_urlb.evaluation.names import LEVELS, method
-from sb3_dreamer_urlb.evaluation.rows import Row
+from sb3_dreamer_urlb.evaluation.rows import CHANGED, Row
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, bars, finish, frames_label, new_figure
 
 
 def perturbed(study: Study) -> Picture | None:
     """Paper, figure "RWRL tasks": fine-tuning in perturbed environments."""
-    rows = [row for row in study.rows if row["perturbation"] in LEVELS]
-    if not rows:
-        return None
-    tasks = sorted({(row.domain, row.task) for row in rows}, key=lambda one: (one[0] != "walker", one))
 
     def changed(row: Row) -> bool:
-        return row["perturbation"] in LEVELS
+        return row["perturbation"] in LEVELS and not row[CHANGED]
 
+    tasks = sorted({(row.domain, row.task) for row in study.rows if changed(row)}, key=lambda one: (one[0] != "walker", one))
+    if not tasks:
+        return None
     arms = [
         study.arm(f"DreamerV2@{frames_label(n)}", any_task, changed, scratch, lambda row: row.method == "dreamer", frames=n)
         for n in (study.finetune, 1_000_000, 2_000_000)
@@ -82,4 +81,4 @@ def sparsity(study: Study) -> Picture | None:
 
 
 def _jaco(row: Row) -> bool:
-    return row.domain == "jaco" and row["perturbation"] == "" and row["variant"] != "fixed"
+    return row.domain == "jaco" and not (row["perturbation"] or row[CHANGED]) and row["variant"] != "fixed"

@@ -28,6 +28,8 @@ RESULT = ("return_mean", "return_std", "episodes")
 #: last column of files that this package writes: when the row was written. Its form tells whole rows from cut ones.
 WRITTEN = "written"
 NONE = "none"
+#: column of the arguments that make another task of an id; rows of the task as it is registered have none
+CHANGED = "environment"
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_dreamer_urlb.evaluation.names import UnknownName, counted
-from sb3_dreamer_urlb.evaluation.row import DESCRIBING, NONE, REQUIRED, RESULT, WRITTEN, Row, texts
+from sb3_dreamer_urlb.evaluation.row import CHANGED, DESCRIBING, NONE, REQUIRED, RESULT, WRITTEN, Row, texts
 from sb3_dreamer_urlb.evaluation.row_parsing import frames, parse
 
 __all__ = [
+    "CHANGED",
     "DESCRIBING",
     "NONE",
     "REQUIRED",

@@ -226,10 +226,21 @@ OTHERS: list[dict[str, Any]] = [
     {"preset": "small"},
     {"further": {"observation": "state"}},
     {"further": {"perturbation": "easy"}},
+    {"further": {"environment": '{"time_limit": 5}'}},
     {"further": {"variant": "sparse"}},
     {"further": {"arm": "mine"}},
     {"further": {"anything": "else"}},
 ]
+
+
+@pytest.mark.parametrize("other", OTHERS[3:6], ids=str)
+def test_a_changed_task_is_no_run_of_the_benchmark(other: dict[str, Any]) -> None:
+    alien = replace(ROW, seed=9, **other)
+    study = Study([ROW, alien])
+    arm = study.arm("all")
+    assert arm.rows == (ROW,)
+    study.show([arm])
+    assert study.left_out() == [alien]
 
 
 @pytest.mark.parametrize("other", OTHERS, ids=str)
@@ -255,7 +266,7 @@ def test_only_what_planned_alone_is_a_point_of_the_discrepancy(monkeypatch: pyte
     assert points == [(0.2, 0.5)]
 
 
-@pytest.mark.parametrize("other", [*OTHERS[:1], *OTHERS[3:5]], ids=str)
+@pytest.mark.parametrize("other", [*OTHERS[:1], *OTHERS[3:6]], ids=str)
 def test_the_bars_of_zero_shot_are_of_one_length_and_the_task_itself(
     other: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
