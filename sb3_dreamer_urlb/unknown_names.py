@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 #: near names that are told
@@ -42,19 +43,30 @@ def did_you_mean(names: Iterable[Any], known: Iterable[str]) -> str:
     return f" Did you mean {' or '.join(map(repr, found))}?" if found else ""
 
 
-def unexpected_arguments(caller: str, names: Iterable[str], known: Iterable[str], listed: str) -> UnknownNameError:
+def unexpected_arguments(
+    caller: str,
+    names: Iterable[str],
+    known: Iterable[str],
+    listed: str,
+    within: Mapping[str, Container[str]] = MappingProxyType({}),
+) -> UnknownNameError:
     """The error for keywords of a call with more arguments than a message could list.
 
     :param caller: what was called
     :param names: keywords that it does not have
     :param known: those that it has
     :param listed: where all of them can be read
+    :param within: arguments that are dictionaries → keys that they take
     """
     shown = ", ".join(map(repr, names := list(names)))
     plural = "s" if len(names) > 1 else ""
+    places = {name: [which for which, keys in within.items() if name in keys] for name in names}
+    found = "".join(
+        f" {name} is a key of {' or '.join(which)}: {which[0]}={{{name!r}: ...}}." for name, which in places.items() if which
+    )
+    near = did_you_mean([name for name in names if not places[name]], known)
     return UnknownNameError(
-        f"{caller}: got {'' if plural else 'an '}unexpected keyword argument{plural} {shown}.{did_you_mean(names, known)} "
-        f"{listed} lists all."
+        f"{caller}: got {'' if plural else 'an '}unexpected keyword argument{plural} {shown}.{found}{near} {listed} lists all."
     )
 
 

@@ -322,4 +322,4 @@ def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any])
             raise UnknownNameError(f"{me}.load: got an unexpected keyword argument {name!r}: {why.format(me=me)}.")
     known = [*algorithm.argument_names(), "device"]
     if unknown := [name for name in kwargs if name not in known]:
-        raise unexpected_arguments(f"{me}.load", unknown, known, f"help({me})")
+        raise unexpected_arguments(f"{me}.load", unknown, known, f"help({me})", algorithm.names_within())

@@ -36,7 +36,8 @@ def with_presets(
         def wrapped(*args: Any, **kwargs: Any) -> None:
             args, kwargs = plain(args), plain(kwargs)
             if unknown := [name for name in kwargs if name not in signature.parameters]:
-                raise unexpected_arguments(type(args[0]).__name__, unknown, known, f"help({listed})")
+                kind = type(args[0])
+                raise unexpected_arguments(kind.__name__, unknown, known, f"help({listed})", kind.names_within())
             try:
                 given = signature.bind_partial(*args, **kwargs).arguments
             except TypeError as error:

@@ -61,6 +61,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
     "precision",
     "compile",
 }
+FILLED_IN = frozenset(POLICY_ARGUMENTS_OF_THE_MODEL | checks.REPLAY_ARGUMENTS_OF_THE_MODEL)
 #: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assignable_arguments.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -24,7 +25,7 @@ from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.nn.nets import MLP
-from sb3_dreamer_urlb.planning import Planner, make_planner
+from sb3_dreamer_urlb.planning import Planner, PlannerConfig, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import constructed
 from sb3_dreamer_urlb.spaces.actions import make_actions
@@ -125,6 +126,7 @@ class DreamerV2(AgentAlgorithm):
     policy_class: type[DreamerPolicy]
     assignable = arguments.ASSIGNABLE
     of_the_networks = arguments.OF_THE_NETWORKS
+    filled_in = arguments.FILLED_IN
     before_fine_tuning = arguments.BEFORE_FINE_TUNING
     presets_made_for = MADE_FOR
     policy: DreamerPolicy
@@ -287,6 +289,11 @@ class DreamerV2(AgentAlgorithm):
             **self.policy_kwargs,
         )
         return policy
+
+    @classmethod
+    def names_within(cls) -> dict[str, set[str]]:
+        """As ever, with those of a planner."""
+        return {**super().names_within(), "planner_kwargs": {each.name for each in dataclasses.fields(PlannerConfig)}}
 
     def _new_planner(self) -> Planner | None:
         return make_planner(self.planner, self.planner_kwargs, self.gae_lambda, make_actions(self.action_space).classes)

@@ -30,6 +30,7 @@ POLICY_ARGUMENTS_OF_THE_MODEL = {
 
 #: arguments of the replay that it fills in, too
 REPLAY_ARGUMENTS_OF_THE_MODEL = {"frame_stack", "n_steps", "gamma", "sampling"}
+FILLED_IN = frozenset(POLICY_ARGUMENTS_OF_THE_MODEL | REPLAY_ARGUMENTS_OF_THE_MODEL | checks.REPLAY_ARGUMENTS_OF_THE_MODEL)
 #: what can be assigned on a model, see :attr:`~sb3_dreamer_urlb.algorithm.assignable_arguments.AssignableArguments.assignable`
 ASSIGNABLE = frozenset(
     {

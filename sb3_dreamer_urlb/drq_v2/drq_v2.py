@@ -88,6 +88,7 @@ class DrQv2(AgentAlgorithm):
     policy_class: type[DrQPolicy]
     assignable = arguments.ASSIGNABLE
     of_the_networks = arguments.OF_THE_NETWORKS
+    filled_in = arguments.FILLED_IN
     before_fine_tuning = arguments.BEFORE_FINE_TUNING
     presets_made_for = MADE_FOR
     policy: DrQPolicy

@@ -51,6 +51,8 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]]
+    #: arguments of policies and replays that the algorithm fills in itself
+    filled_in: ClassVar[frozenset[str]] = frozenset()
     replay_buffer: SequenceReplayBuffer
     #: a key of :data:`sb3_dreamer_urlb.phases.PHASES`
     phase: str
@@ -101,6 +103,15 @@ class SavedAlgorithm(OffPolicyAlgorithm):
         for kind in itertools.takewhile(lambda kind: not inspect.isabstract(kind), cls.__mro__):
             found = {**named_parameters(kind), **found}
         return found
+
+    @classmethod
+    def names_within(cls) -> dict[str, set[str]]:
+        """Dictionaries among the constructor arguments, and what they may hold, for messages about what is none of these."""
+        policies: list[type] = [*cls.policy_aliases.values()]
+        kinds: dict[str, list[type]] = {"policy_kwargs": policies, "replay_buffer_kwargs": [SequenceReplayBuffer]}
+        return {
+            which: {name for kind in each for name in named_parameters(kind)} - cls.filled_in for which, each in kinds.items()
+        }
 
     def arguments(self) -> dict[str, Any]:
         """The constructor arguments, as the model has them now; without those that a subclass keeps nowhere."""

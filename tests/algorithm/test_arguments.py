@@ -272,6 +272,23 @@ def test_an_argument_that_it_has_not_is_named_with_those_that_are_near(
 
 
 @each
+def test_a_key_of_a_dictionary_is_answered_with_the_dictionary(algorithm, policy, replay, method, tmp_path):
+    make(algorithm).save(tmp_path / "model")
+    names = {"net_arch": "policy_kwargs", "store": "replay_buffer_kwargs"}
+    if algorithm is DreamerV2:
+        names["horizon"] = "planner_kwargs"
+    for name, dictionary in names.items():
+        for call in (
+            lambda name=name: make(algorithm, **{name: 1}),
+            lambda name=name: algorithm.load(tmp_path / "model", **{name: 1}),
+        ):
+            with pytest.raises(
+                TypeError, match=rf"'{name}'\. {name} is a key of {dictionary}: {dictionary}={{'{name}': \.\.\.}}\. h"
+            ):
+                call()
+
+
+@each
 def test_what_load_changes_nothing_by_is_answered_in_its_own_words(algorithm, policy, replay, method, tmp_path):
     make(algorithm).save(tmp_path / "model")
     for name, message in (
