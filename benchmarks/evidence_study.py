@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sb3_dreamer_urlb.nn.precision import cpu_multiplies_short
+from sb3_dreamer_urlb.nn.precision import cpu_is_fast_at_short
 
 ROOT = Path(__file__).parents[1] / "results" / "evidence"
 #: body → the environment of its pre-training, whose reward nobody sees
@@ -85,7 +85,7 @@ SETTINGS = {
         "small",
         50_000,
         10_000,
-        further={"train_freq": 5, "precision": "bfloat16" if cpu_multiplies_short() else "float32"},
+        further={"train_freq": 5, "precision": "bfloat16" if cpu_is_fast_at_short() else "float32"},
     ),
     # 100k frames each, at the paper's size: for a GPU.
     "paper": Setting("CnnPolicy", "pixels", "paper", 50_000, 50_000, "auto"),

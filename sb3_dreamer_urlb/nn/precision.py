@@ -31,7 +31,7 @@ def choose(precision: str, part: str, device: th.device | str, feature_size: int
     """
     on_cpu = th.device(device).type == "cpu"
     if precision == "auto":
-        fast = on_cpu and _cpu_has_short_products() and cpu_multiplies_short() and feature_size >= AUTO_FEATURE_SIZE[part]
+        fast = on_cpu and cpu_is_fast_at_short() and feature_size >= AUTO_FEATURE_SIZE[part]
         return th.bfloat16 if fast else th.float32
     if precision == "bfloat16" and on_cpu:
         if not cpu_multiplies_short():
@@ -101,6 +101,11 @@ def cpu_multiplies_short() -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def cpu_is_fast_at_short() -> bool:
+    """Whether the processor has products of bfloat16 numbers, AMX's or AVX-512's, and torch takes them."""
+    return _cpu_has_short_products() and cpu_multiplies_short()
 
 
 @functools.cache

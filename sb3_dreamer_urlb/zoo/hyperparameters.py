@@ -49,12 +49,13 @@ def check(hyperparams: dict[str, Any], algorithm: str, arguments: Iterable[str])
     :raises ValueError: naming the key, what stands there and what was expected
     """
     known = {*arguments, *OWN_KEYS}
-    for name in hyperparams:
-        if name not in known:
-            meant = did_you_mean([name], known)
-            raise ValueError(f"Unknown hyperparameter {name!r}, neither of rl_zoo3's nor of {algorithm}'s.{meant}")
-    for name in sorted(OF_THE_COMMAND_LINE & set(hyperparams)):
-        raise ValueError(f"{name} is no hyperparameter: give --{name.replace('_', '-')} on the command line.")
+    if unknown := [name for name in hyperparams if name not in known]:
+        which = f"hyperparameter{'s' * (len(unknown) > 1)} {', '.join(map(repr, unknown))}"
+        raise ValueError(f"Unknown {which}, neither of rl_zoo3's nor of {algorithm}'s.{did_you_mean(unknown, known)}")
+    if misplaced := sorted(OF_THE_COMMAND_LINE & set(hyperparams)):
+        verb = "are no hyperparameters" if len(misplaced) > 1 else "is no hyperparameter"
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in misplaced)
+        raise ValueError(f"{', '.join(misplaced)} {verb}: give {options} on the command line.")
     if not isinstance(kwargs := hyperparams.get(OF_THE_ENVIRONMENT) or {}, dict | str):
         raise ValueError(f"{OF_THE_ENVIRONMENT} must be arguments of the environment by name, got {kwargs!r}.")
     if hyperparams.get("noise_type") is not None and "noise_std" not in hyperparams:

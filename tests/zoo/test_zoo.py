@@ -398,6 +398,8 @@ def test_a_wrong_hyperparameter_costs_a_line(zoo, capsys, param, message):
             "'n_timestep', neither of rl_zoo3's nor of dreamerv2's. Did you mean 'n_t",
         ),
         (f"{STAND}:\n  n_timesteps: 8\n  polcy: CnnPolicy\n", "Did you mean 'policy'"),
+        (f"{STAND}:\n  polcy: CnnPolicy\n  zzz: 1\n", "Unknown hyperparameters 'polcy', 'zzz', neither"),
+        (f"{STAND}:\n  seed: 1\n  device: cpu\n", "device, seed are no hyperparameters: give --device, --seed on the command"),
         (f"{FLIP}:\n  policy: CnnPolicy\n", f"Hyperparameters not found for dreamerv2-{STAND} in own.yml"),
         (f"{STAND}: 3\n", f"own.yml: expected hyperparameters by environment, got 3 for {STAND}"),
         ("- a\n", "own.yml: expected hyperparameters by environment, got ['a']"),
