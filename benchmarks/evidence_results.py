@@ -31,6 +31,7 @@ LABELS = {
     "lbs-fresh": "LBS, fresh actor",
     "random-fresh": "random actions, fresh actor",
     "plan2explore-kept": "Plan2Explore, actor kept",
+    "plan2explore-fresh": "Plan2Explore, fresh actor",
     **{
         f"lbs-kept-{name}": f"LBS, actor kept, {changed}"
         for name, changed in {

@@ -40,6 +40,7 @@ ARMS = {
     "lbs-fresh": Arm("lbs"),
     "random-fresh": Arm("random"),
     "plan2explore-kept": Arm("plan2explore", True),
+    "plan2explore-fresh": Arm("plan2explore"),
     # What else may help or hide it: how soon the new critic's target follows; how fast the model is retrained, on how much.
     "lbs-kept-target-2": Arm("lbs", True, {"target_update_interval": 2}),
     "lbs-kept-target-50": Arm("lbs", True, {"target_update_interval": 50}),
@@ -103,7 +104,7 @@ STUDY: dict[str, tuple[Tier, ...]] = {
         (("lbs-fresh",), ("run", "flip"), 10),
         (tuple(arm for arm in ARMS if ARMS[arm].changes), ("flip",), 3),
         (("lbs-kept", "scratch"), ("spin",), 10),
-        (("random-fresh", "lbs-fresh", "plan2explore-kept"), ("run", "flip", "spin"), 10),
+        (("random-fresh", "lbs-fresh", "plan2explore-kept", "plan2explore-fresh"), ("run", "flip", "spin"), 10),
     ),
     "pixels": (
         (("lbs-kept", "scratch"), ("run", "flip"), 5),

@@ -15,7 +15,8 @@ import numpy as np
 from sb3_dreamer_urlb.evaluation.agent_rows import FROM_SCRATCH
 from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.evaluation.rows import Row, read_rows
-from sb3_dreamer_urlb.evaluation.run_logs import Logs, Series, number, read_logs
+from sb3_dreamer_urlb.evaluation.run_logs import WINDOW, Series, number, read_logs
+from sb3_dreamer_urlb.number_checks import is_integer
 from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT
 
 #: a snapshot of each of these names is looked for, in this order; then the newest zip
@@ -122,7 +123,8 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         raise FileNotFoundError(f"{folder} is no folder of a run.")
     facts = RunFacts(folder)
     _read_snapshot(facts)
-    logs = read_logs(folder, facts.switch, int(facts.arguments.get("stats_window_size") or Logs.window))
+    window: Any = facts.arguments.get("stats_window_size")
+    logs = read_logs(folder, facts.switch, window if is_integer(window) and window >= 1 else WINDOW)
     facts.series = logs.series
     facts.notes += [*logs.notes, *damaged_files(folder)]
     for kind in (AGENT, OPEN_LOOP):

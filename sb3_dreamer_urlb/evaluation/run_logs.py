@@ -19,6 +19,8 @@ from sb3_dreamer_urlb.evaluation.names import counted
 from sb3_dreamer_urlb.runs.run_folder import PRETRAINING_LOGS
 
 Series = list[tuple[float, float]]
+#: last episodes whose mean Stable-Baselines3 logs, where nobody says how many
+WINDOW = 100
 
 
 @dataclass
@@ -26,12 +28,10 @@ class Logs:
     """
     :param series: tag → (agent steps, value)
     :param notes: what could not be read, and why
-    :param window: last episodes whose mean Stable-Baselines3 logs
     """
 
     series: dict[str, Series] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    window: int = 100
 
 
 def read_logs(folder: Path, switch: float | None, window: int) -> Logs:
@@ -42,7 +42,7 @@ def read_logs(folder: Path, switch: float | None, window: int) -> Logs:
     :param window: last episodes whose mean is the return
     :raises ValueError: if logs of several runs lie below it
     """
-    logs = Logs(window=window)
+    logs = Logs()
     for path in (each / "progress.csv" for each in _log_folders(folder, "progress.csv")):
         _read_progress(logs, path, str(path.relative_to(folder)))
     folders = _log_folders(folder, "events.out.tfevents.*")
