@@ -199,8 +199,8 @@ def test_the_command_takes_the_folder_of_a_run_of_the_zoo(tiny_model: Any, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--episodes", "0"], "--episodes must be an integer of at least 1, got 0"),
-        (["--set", "arm"], "--set: expected NAME=VALUE, got 'arm'"),
+        (["--set", "arm=mine"], "--set is about the row: it needs --rows FILE."),
+        (["--set", "arm", "--rows", "rows.csv"], "--set: expected NAME=VALUE, got 'arm'"),
         (["--set", "keep_actor=perhaps", "--rows", "rows.csv"], "expected true, false or none, got 'perhaps'"),
         (["--planner", "on"], "the model has none"),
         (["--env-kwargs", "length"], "--env-kwargs: expected NAME=VALUE"),

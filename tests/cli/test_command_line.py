@@ -90,11 +90,6 @@ def test_a_number_below_its_least_or_none_at_all_is_refused(least, value):
             at_least(least)(text)
 
 
-def test_columns_without_a_row_are_refused_before_anything_is_read(capsys):
-    assert main(["evaluate", "no.zip", "--env", "walker", "--set", "arm=mine"]) == 2
-    assert capsys.readouterr().err == "sb3-dreamer-urlb: --set is about the row: it needs --rows FILE.\n"
-
-
 @pytest.mark.parametrize(
     ("message", "end"),
     [
@@ -106,6 +101,12 @@ def test_columns_without_a_row_are_refused_before_anything_is_read(capsys):
 )
 def test_a_choice_that_is_none_is_answered_with_near_ones(message, end):
     assert with_near_choices(message) == message + end
+
+
+def test_a_number_is_refused_where_it_is_given(capsys):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["evaluate", "x", "--env", "y", "--episodes", "0"])
+    assert "argument --episodes: must be an integer of at least 1, got '0'." in capsys.readouterr().err
 
 
 def test_choices_of_an_option_are_answered_likewise(capsys):
