@@ -123,6 +123,43 @@ def needed(found: Scores) -> str:
     return "\n".join(lines)
 
 
+def parts(by_run: dict[str, list[tuple[int, float]]]) -> str:
+    """What a world model of random data gives, what one of LBS's, and what its actor adds, over the seeds that all have.
+
+    :param by_run: name of a run → agent step and return of its episodes
+    """
+    steps = ("scratch", "random-fresh", "lbs-fresh", "lbs-kept")
+    lines = [
+        f"| task | seeds | {' | '.join(LABELS[arm] for arm in steps)} | actor kept, by quarter |",
+        "|---|---|" + "---|" * 5,
+    ]
+    for task in sorted({name.split("/")[0] for name in by_run}):
+        seeds = set.intersection(
+            *({name.split("/")[2] for name in by_run if name.startswith(f"{task}/{arm}/")} for arm in steps)
+        )
+        if len(seeds) < 2:
+            continue
+        size = next((size for size in study.SETTINGS if size != "state" and task.startswith(study.prefix(size))), "state")
+        runs = {arm: [by_run[f"{task}/{arm}/{seed}"] for seed in sorted(seeds)] for arm in steps}
+        means = [np.mean([np.mean([value for _, value in run]) for run in runs[arm]]) for arm in steps]
+        with_actor, without = (
+            np.mean([quarters(run, study.SETTINGS[size].finetuning) for run in runs[arm]], 0)
+            for arm in ("lbs-kept", "lbs-fresh")
+        )
+        cells = [*(f"{value:.0f}" for value in means), ", ".join(f"{value:+.0f}" for value in with_actor - without)]
+        lines.append(f"| {task} | {len(seeds)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def quarters(run: list[tuple[int, float]], steps: int) -> list[float]:
+    """Mean return in each quarter of a fine-tuning.
+
+    :param run: agent step and return of its episodes
+    :param steps: agent steps of it all
+    """
+    return [float(np.mean([value for step, value in run if i < 4 * step / steps <= i + 1])) for i in range(4)]
+
+
 def draw(path: Path, size: str = "state") -> None:
     """Returns of the training episodes over frames, interquartile mean and interval over seeds, a panel a task.
 
@@ -170,6 +207,7 @@ def main() -> None:
     options = parser.parse_args()
     found = scores()
     print(f"{table(found)}\n\nDifference from scratch, and seeds an arm that it needs:\n\n{needed(found)}")
+    print(f"\nWhich part helps: mean return over the seeds that all four have:\n\n{parts(study.curves())}")
     if options.figure is not None:
         draw(options.figure, options.setting)
 

@@ -42,20 +42,24 @@ def compare(
         )
     unit = "agent steps" if unknown else "environment frames"
     figure, [axes] = new_figure(1, COLUMN * 1.4, 2.3)
-    table = Table(
-        "comparison",
-        f"{name} at the end of the shorter runs, mean ± standard error of the seeds.",
-        ["", name, unit.split()[-1], "seeds"],
+    curves = {label: _mean_curve(members, name) for label, members in groups.items()}
+    # Where all have been: longer runs may have learnt more by their own end.
+    end = min(max(points) for points in curves.values())
+    common = end >= max(min(points) for points in curves.values())
+    where = (
+        f"at {frames_label(end)} {unit}, which all have come to" if common else "at the end of each, for no frames are common"
     )
+    table = Table("comparison", f"{name} {where}: mean ± standard error of the seeds.", ["", name, unit.split()[-1], "seeds"])
     handles = []
     for i, (label, members) in enumerate(groups.items()):
-        points = _mean_curve(members, name)
+        points = curves[label]
         handles += lines(axes, {label: points}, {at: float(at) for at in points}, 1, band=True, first=i)
         for run in members:
             if run.switch is not None:
                 axes.axvline(run.switch * (run.action_repeat or 1), color="#999999", ls=":", lw=0.8, zorder=1)
-        last = max(points)
-        table.lines.append([label, with_error(points[last], digits=1), frames_label(last), str(len(members))])
+        last = end if common else max(points)
+        value = _mean_at(_frames_and_values(members, name), last)
+        table.lines.append([label, with_error(value, digits=1), frames_label(last), str(len(members))])
     what = IN_WORDS.get(name, name)
     axes.set(xlabel=unit, ylabel=what)
     axes.xaxis.set_major_formatter(lambda value, _: frames_label(round(value)))
@@ -90,18 +94,26 @@ def _no_such_log(wanted: Sequence[str], runs: Sequence[RunFacts]) -> str:
 
 def _mean_curve(members: Sequence[RunFacts], name: str) -> dict[int, Estimate]:
     """Over the frames that all runs of a group have come to."""
-    curves = [np.array(run.series[name], float) * (run.action_repeat or 1, 1) for run in members]
+    curves = _frames_and_values(members, name)
     begin, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
     if begin > end:
         raise ValueError(f"{', '.join(str(run.folder) for run in members)} have no frames in common.")
-    at = np.unique(np.linspace(begin, end, POINTS).round())
-    values = np.stack([np.interp(at, curve[:, 0], curve[:, 1]) for curve in curves])
-    found = {}
-    for frames, column in zip(at, values.T, strict=True):
-        error = standard_error(list(column))
-        mean = float(column.mean())
-        found[int(frames)] = Estimate(mean, mean - error, mean + error, 1, (len(members), len(members)))
-    return found
+    return {int(at): _mean_at(curves, at) for at in np.unique(np.linspace(begin, end, POINTS).round())}
+
+
+def _frames_and_values(members: Sequence[RunFacts], name: str) -> list[np.ndarray]:
+    return [np.array(run.series[name], float) * (run.action_repeat or 1, 1) for run in members]
+
+
+def _mean_at(curves: Sequence[np.ndarray], frames: float) -> Estimate:
+    """Mean of runs ± its standard error.
+
+    :param curves: frames and value of each run, (n, 2)
+    :param frames: where; between two points of a run on the line through them
+    """
+    values = [float(np.interp(frames, curve[:, 0], curve[:, 1])) for curve in curves]
+    mean, error = float(np.mean(values)), standard_error(values)
+    return Estimate(mean, mean - error, mean + error, 1, (len(curves), len(curves)))
 
 
 def _settings(groups: Mapping[str, Sequence[RunFacts]]) -> list[dict[str, str]]:

@@ -71,6 +71,28 @@ def test_missing_runs_are_done_once(study, evidence, capsys):
     assert capsys.readouterr().out.count("done") == 3
 
 
+def test_what_each_part_adds_by_hand(study, results):
+    length = study.SETTINGS["state"].finetuning
+
+    def run(*values):
+        return [((i + 1) * length // 4, value) for i, value in enumerate(values)]
+
+    runs = {
+        f"flip/{arm}/{seed}": run(*(value + 10 * seed for value in values))
+        for arm, values in {
+            "scratch": (0, 0, 0, 0),
+            "random-fresh": (4, 4, 4, 4),
+            "lbs-fresh": (4, 8, 12, 16),
+            "lbs-kept": (14, 10, 11, 17),
+        }.items()
+        for seed in range(2)
+    }
+    line = results.parts({**runs, "flip/scratch/7": run(900, 900, 900, 900), "run/scratch/0": run(1, 1, 1, 1)}).splitlines()[
+        2:
+    ]
+    assert line == ["| flip | 2 | 5 | 9 | 15 | 18 | +10, +2, -1, +1 |"]
+
+
 def test_another_process_at_a_run_is_left_alone(evidence, monkeypatch):
     monkeypatch.setattr(evidence, "do", lambda run: pytest.fail("it was begun twice"))
     with evidence.locked("pretraining-lbs-0.lock"), evidence.locked("run-scratch-0.lock"):

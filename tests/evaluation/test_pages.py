@@ -320,6 +320,18 @@ def test_unknown_tags_are_answered_with_those_there_are(run: Path, tmp_path: Pat
     assert "rollout/ep_rew_mean" in said and "Did you mean 'train/image_loss' or" in said
 
 
+def test_groups_are_compared_where_all_have_come_to(tmp_path: Path) -> None:
+    for name, values in {"short": {100: 1, 200: 3}, "long": {50: 0, 150: 10, 250: 20, 900: 70}, "late": {901: 5}}.items():
+        (tmp_path / name).mkdir()
+        lines = ["time/total_timesteps,rollout/ep_rew_mean", *(f"{step},{value}" for step, value in values.items())]
+        (tmp_path / name / "progress.csv").write_text("\n".join(lines))
+    paths = {name: [tmp_path / name] for name in ("short", "long", "late")}
+    table, _ = compare_runs({name: paths[name] for name in ("short", "long")}, tmp_path / "c.html")
+    assert [line[1:3] for line in table.lines] == [["3.0", "200"], ["15.0", "200"]] and "at 200 agent steps" in table.caption
+    table, _ = compare_runs({name: paths[name] for name in ("long", "late")}, tmp_path / "c.html")
+    assert [line[1:3] for line in table.lines] == [["70.0", "900"], ["5.0", "901"]] and "no frames are common" in table.caption
+
+
 @pytest.mark.parametrize("content", [b"", b"PK\3\4 broken", b"no zip"])
 def test_damaged_evaluations_are_named(run: Path, tmp_path: Path, content: bytes) -> None:
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("progress.csv"))
