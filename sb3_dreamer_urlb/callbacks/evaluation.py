@@ -130,17 +130,27 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
             raise ValueError("Rows tell runs apart by their seed: give the model one, or columns={'seed': ...}.")
         if self.planner == ON and getattr(self.model, "planner", None) is None:
             raise ValueError(without_planner(self.model))
+        self._begin_phase()
         # An evaluation that was due before the run was cut off has been.
         self._due = (self._dreamer.phase, self._dreamer.phase_frames // self.every_frames)
 
     def _on_step(self) -> bool:
         model = self._dreamer
         phase, number = model.phase, model.phase_frames // self.every_frames
-        before = self._due[1] if self._due[0] == phase else 0
+        self._begin_phase()
+        before = self._due[1]
         self._due = (phase, number)
         if number <= before or (PHASES[phase].explores and not self.pretraining):
             return True
         return self.evaluate()
+
+    def _begin_phase(self) -> None:
+        """An agent that explores is no best one of the task's: where the phase is another, all begins anew."""
+        phase = self._dreamer.phase
+        if self._due[0] not in ("", phase):
+            self.best_mean_reward = -np.inf
+        if self._due[0] != phase:
+            self._due = (phase, 0)
 
     def evaluate(self) -> bool:
         """Evaluate now.

@@ -32,7 +32,7 @@ from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 from sb3_dreamer_urlb.zoo import configs, env_arguments, hyperparameters, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
-from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
+from sb3_dreamer_urlb.zoo.callbacks import BestOfPhase, RunSnapshotCallback
 
 
 def register() -> None:
@@ -222,10 +222,12 @@ def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
             callback.save_path = str(Path(manager.save_path) / "snapshots")
         if isinstance(callback, VideoCallback) and callback.folder is None:
             callback.folder = Path(manager.save_path) / "videos"
+    evaluation = next((callback for callback in manager.callbacks if isinstance(callback, EvalCallback)), None)
+    if evaluation is not None:
+        manager.callbacks.insert(manager.callbacks.index(evaluation), BestOfPhase(evaluation))
     kept = any(isinstance(callback, RunCheckpointCallback) for callback in manager.callbacks)
     if manager.optimize_hyperparameters or manager.checkpoint_options is False or kept:
         return
-    evaluation = next((callback for callback in manager.callbacks if isinstance(callback, EvalCallback)), None)
     options = {"evaluation": evaluation, "verbose": int(manager.verbose > 0), "resume": "auto", **manager.checkpoint_options}
     manager.callbacks.append(RunCheckpointCallback(Path(manager.save_path) / CHECKPOINT, **options))
 

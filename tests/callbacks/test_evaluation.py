@@ -187,6 +187,18 @@ def test_who_has_no_planner_says_so(tmp_path: Path, capsys: Any) -> None:
         model.learn(4, EvaluationCallback(CounterEnv(5), planner="on"))
 
 
+def test_an_agent_that_explores_is_no_best_one_of_the_task(tiny_model: Any, tmp_path: Path) -> None:
+    model = tiny_model(CounterEnv(5, **WALKER), intrinsic_reward="lbs", learning_starts=100)
+    evaluation = EvaluationCallback(CounterEnv(5, **WALKER), 20, 1, pretraining=True, best_model_save_path=tmp_path)
+    model.learn(20, evaluation)
+    best, mean = DreamerV2.load(tmp_path / "best_model"), evaluation.best_mean_reward
+    assert best.phase == "pretraining" and np.isfinite(mean)
+    evaluation.best_mean_reward = 1e9  # as if exploring had paid
+    model.fine_tune()
+    model.learn(20, evaluation, reset_num_timesteps=False)
+    assert evaluation.best_mean_reward == mean and DreamerV2.load(tmp_path / "best_model").phase == "finetuning"
+
+
 def test_the_command_takes_the_folder_of_a_run_of_the_zoo(tiny_model: Any, tmp_path: Path, capsys: Any) -> None:
     run = tmp_path / "logs" / "run_1"
     tiny_model(CounterEnv(5)).learn(8, RunCheckpointCallback(run / "checkpoint", every_frames=4))

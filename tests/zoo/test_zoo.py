@@ -225,6 +225,8 @@ def test_one_run_through_both_phases_with_all_savers(zoo, capsys):
     assert {path.name for path in (run / "snapshots").iterdir()} == {"snapshot_40.zip", "snapshot_80.zip"}
     saved = {path.name for path in run.iterdir()}
     assert {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", "rl_model_20_steps.zip", "0.monitor.csv"} <= saved
+    # All episodes earn the same here: without a new beginning the agent that explored would stay the best.
+    assert DreamerV2.load(run / "best_model.zip").phase == "finetuning"
     model.load_replay_buffer(run / "replay_buffer.pkl")
     assert model.replay_buffer.phase == "finetuning"
 
