@@ -10,7 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
+from sb3_dreamer_urlb.envs.env_steps import is_fault
 from sb3_dreamer_urlb.envs.facts import steps_an_episode
+from sb3_dreamer_urlb.envs.info_keys import TRUNCATED
 from sb3_dreamer_urlb.replay.episode_buffer import MAX_EPISODE_ROWS
 
 #: what presets are made for
@@ -46,6 +48,19 @@ def warn_if_no_episode_fits(model: Any) -> None:
         warnings.warn(
             f"buffer_size={model.buffer_size} holds no whole episode, only the last rows of one: the environment's have up to "
             f"{steps} steps, which are {steps + 1} rows."
+        )
+
+
+def warn_if_ends_go_unheeded(dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+    """Where an episode terminates, and the agent learns nothing of ends.
+
+    :param dones: of a step, (n_envs,)
+    :param infos: of the same
+    """
+    if any(done and not (info.get(TRUNCATED, False) or is_fault(info)) for done, info in zip(dones, infos, strict=True)):
+        warnings.warn(
+            "The environment ended an episode before its time limit, and the agent has no discount head: to it nothing is lost "
+            "by that. Make it with discount_head=True; without, it takes what the environment says, here never_terminates=True."
         )
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dreamer_urlb import phases
-from sb3_dreamer_urlb.algorithm import left_environments
+from sb3_dreamer_urlb.algorithm import advice, left_environments
 from sb3_dreamer_urlb.algorithm.environment_checks import needed_env
 from sb3_dreamer_urlb.algorithm.saving import SavingAlgorithm
 from sb3_dreamer_urlb.algorithm.training_loop import LearningVecEnv
@@ -172,6 +172,10 @@ class CollectingAlgorithm(SavingAlgorithm):
         assert self.env is not None
         return last_touches(self.env) != self._touches
 
+    def _learns_of_ends(self) -> bool:
+        """Whether the agent learns that a terminated episode gives no more rewards."""
+        return True
+
     def _replayed_beside(self) -> dict[str, np.ndarray]:
         """Further columns of the replay's rows, of the step that was just made, by name: (n, …)."""
         return {}
@@ -196,8 +200,10 @@ class CollectingAlgorithm(SavingAlgorithm):
         next_obs = copy.deepcopy(original_obs)
         for i in np.flatnonzero(dones):
             _put(next_obs, int(i), self._last_of_episode(int(i), infos[i]))
-        env_steps.check_finite(next_obs, reward, self.num_timesteps)
-        self._check_classes("step", next_obs, new_obs)
+        env_steps.check_finite(next_obs, reward, f"step {self.num_timesteps}")
+        self._check_seen("step", f"step {self.num_timesteps}", next_obs, new_obs)
+        if not self._learns_of_ends():
+            advice.warn_if_ends_go_unheeded(dones, infos)
         beside = self._replayed_beside()
         replay_buffer.add(self._last_original_obs, next_obs, buffer_action, reward, dones, infos, **beside)  # type: ignore[arg-type]
         # Environments may write the next observation into the same arrays.
@@ -245,13 +251,16 @@ class CollectingAlgorithm(SavingAlgorithm):
         self._touches = last_touches(self.env)
         # Environments may write the next observation into the same arrays.
         self._last_obs = copy.deepcopy(self._last_obs)
-        self._check_classes("reset", self._last_obs)
+        self._check_seen("reset", "reset", self._last_obs)
         self._leave_standing()
         if self._vec_normalize_env is not None:
             self._last_original_obs = self._original_obs(self._last_obs)
 
-    def _check_classes(self, asked: str, *observations: Any) -> None:
-        """Before anything out of its space is acted on or kept; ``asked`` is what the environments did."""
+    def _check_seen(self, asked: str, when: str, *observations: Any) -> None:
+        """Before anything out of its space, or NaN, is acted on or kept; ``asked`` is what the environments did."""
+        assert self.env is not None
+        for seen in observations:
+            env_steps.check_finite(seen, np.zeros(self.env.num_envs), when)
         with asking_to(asked):
             for seen in observations:
                 check_classes("The environments' observation", seen, self.observation_space)

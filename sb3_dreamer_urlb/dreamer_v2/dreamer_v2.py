@@ -257,6 +257,9 @@ class DreamerV2(AgentAlgorithm):
         if self.env is not None and self.discount_head is None:
             self.discount_head = not env_fact(self.env, "never_terminates", False)
 
+    def _learns_of_ends(self) -> bool:
+        return bool(self.discount_head)
+
     def _check_env(self, env: VecEnv) -> None:
         super()._check_env(env)
         arguments.check_episodes_fit(self.batch_length, self.replay_buffer_kwargs, env)

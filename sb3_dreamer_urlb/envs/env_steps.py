@@ -19,12 +19,12 @@ def is_fault(info: dict[str, Any]) -> bool:
     return FAULT in info
 
 
-def check_finite(observation: Any, reward: np.ndarray, step: int) -> None:
+def check_finite(observation: Any, reward: np.ndarray, when: str) -> None:
     """Refuse numbers that are none, where no guard caught them.
 
     :param observation: (n_envs, …), or such by name
     :param reward: (n_envs,)
-    :param step: for the message
+    :param when: for the message, ``"step 7"`` or ``"reset"``
     :raises ValueError: naming the environment, the step and what is wrong
     """
     if what_is_not_finite(observation, reward) is None:
@@ -34,6 +34,6 @@ def check_finite(observation: Any, reward: np.ndarray, step: int) -> None:
         reason = what_is_not_finite(mine, reward[i])
         if reason is not None:
             raise ValueError(
-                f"Environment {i}, step {step}: {reason}; expected finite numbers. To end such episodes and go on, "
+                f"Environment {i}, {when}: {reason}; expected finite numbers. To end such episodes and go on, "
                 "wrap it in sb3_dreamer_urlb.envs.FaultGuard."
             )

@@ -188,3 +188,28 @@ def test_what_is_held_then_is_what_the_warning_says():
         model = DreamerV2("MlpPolicy", env, preset="tiny", device="cpu", buffer_size=20, learning_starts=1000)
     model.learn(150)
     assert 0 < model.replay_buffer.finished_rows <= 20 and model.replay_buffer.longest <= 20
+
+
+# -- ends of episodes ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("terminates", "learns", "warns"), [(True, False, True), (True, True, False), (False, False, False)])
+def test_ends_that_the_agent_learns_nothing_of_are_told(terminates, learns, warns):
+    env = CounterEnv(3, observation_space=VECTOR, terminates=terminates)
+    model = DreamerV2("MlpPolicy", env, preset="tiny", discount_head=learns, **SMALL)
+    with told_meanwhile() as said:
+        model.learn(4)
+    assert any("no discount head" in one for one in said) is warns
+
+
+def test_ends_of_the_second_phase_are_told_where_the_first_had_none():
+    def env(**which):
+        return CounterEnv(3, observation_space=VECTOR, **which)
+
+    model = DreamerV2("MlpPolicy", env(never_terminates=True), preset="tiny", intrinsic_reward="lbs", **SMALL)
+    with told_meanwhile() as said:
+        model.learn(4)
+        assert not any("no discount head" in one for one in said)
+        model.fine_tune(env(terminates=True))
+        model.learn(4)
+    assert any("no discount head" in one for one in said)

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.mistakes import tell
@@ -119,6 +119,21 @@ def test_choices_out_of_their_space_are_refused_before_they_are_kept(choices, wh
         model.learn(8)
     (note,) = raised.value.__notes__
     assert f"asked to {'step' if when else 'reset'}." in note and "check_env(env) tells" in note
+
+
+@pytest.mark.parametrize("normalized", [False, True], ids=["plain", "normalised"])
+@pytest.mark.parametrize("named", [False, True], ids=["alone", "by name"])
+@pytest.mark.parametrize("when", [0, 2, 3, 4], ids=["first", "within an episode", "last", "first of the next"])
+def test_observations_that_are_not_finite_are_refused_before_they_are_kept(when, named, normalized):
+    env = DummyVecEnv([lambda: LeavesItsSpace(BOX, np.float32([0, np.nan, 0]), when, named)])
+    env = VecNormalize(env, norm_reward=False, norm_obs_keys=["way"] if named else None) if normalized else env
+    model = DreamerV2("MultiInputPolicy" if named else "MlpPolicy", env, preset="tiny", device="cpu", learning_starts=100)
+    whose = "observation 'way'" if named else "observation"
+    step = "reset" if when == 0 else f"step {min(when, 3)}"
+    with pytest.raises(ValueError, match=rf"^Environment 0, {step}: the {whose} is not finite; .*FaultGuard"):
+        model.learn(8)
+    for episode in (*model.replay_buffer.episodes, *filter(None, model.replay_buffer.open)):
+        assert all(np.isfinite(column[: len(episode)]).all() for column in episode.columns.values())
 
 
 def test_other_errors_are_left_alone():
