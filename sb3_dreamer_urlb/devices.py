@@ -42,7 +42,7 @@ def known_device(device: th.device | str, argument: str = "device") -> th.device
     """
     try:
         return get_device(device)
-    except (RuntimeError, TypeError) as error:
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
         raise UnknownDeviceError(
             f"{argument} must be {_usual()} or another of torch's, got {device!r}{_hint(device)}"
         ) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 
+import numpy as np
 import pytest
 import torch as th
 from fake_envs import CounterEnv
@@ -53,6 +54,8 @@ def test_a_device_that_is_here(algorithm, device):
         ("tpu", "."),
         ("nonsense", "."),
         (None, "."),
+        (10**30, "."),
+        (np.array([1, 2]), "."),
     ],
 )
 def test_a_device_that_torch_does_not_know(device, hint):

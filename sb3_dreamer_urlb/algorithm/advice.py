@@ -59,8 +59,9 @@ def warn_if_ends_go_unheeded(dones: np.ndarray, infos: list[dict[str, Any]]) -> 
     """
     if any(done and not (info.get(TRUNCATED, False) or is_fault(info)) for done, info in zip(dones, infos, strict=True)):
         warnings.warn(
-            "The environment ended an episode before its time limit, and the agent has no discount head: to it nothing is lost "
-            "by that. Make it with discount_head=True; without, it takes what the environment says, here never_terminates=True."
+            "The environment ended an episode before its time limit, and the agent has no discount head: to it nothing is "
+            "lost by that. Make it with discount_head=True; without, it takes what its first environment says, here "
+            "never_terminates=True."
         )
 
 

@@ -58,13 +58,14 @@ def check_verbose(verbose: Any) -> None:
         raise ValueError(f"verbose must be 0, 1 or 2, got {verbose!r}.")
 
 
-def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None) -> None:
+def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None, **switches: Any) -> None:
     """What ``learn`` is told, before Stable-Baselines3 compares and divides with it, and calls it.
 
     :param total_timesteps: agent steps
     :param log_interval: episodes between two log lines; None for no lines
     :param callback: one, several in a list, or None
-    :raises ValueError: for what is no such number or callback
+    :param switches: what is true or false, by name
+    :raises ValueError: for what is no such number, callback or switch
     """
     for one in callback if isinstance(callback, list) else []:
         if not isinstance(one, BaseCallback):
@@ -78,6 +79,8 @@ def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None) -
         raise ValueError(f"total_timesteps must be a number of agent steps, 0 or more, got {total_timesteps!r}.")
     if log_interval is not None:
         check_integer("log_interval", log_interval, 1)
+    for name, value in switches.items():
+        check_switch(name, value)
 
 
 def given_env(env: Any, argument: str = "env") -> GymEnv:

@@ -267,7 +267,10 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
         :raises NumericalFaultError: if losses or gradients stay non-finite; likewise
         """
         total_timesteps, log_interval = plain(total_timesteps), plain(log_interval)
-        checks.check_learn(total_timesteps, log_interval, callback)
+        reset_num_timesteps, progress_bar = plain(reset_num_timesteps), plain(progress_bar)
+        checks.check_learn(
+            total_timesteps, log_interval, callback, reset_num_timesteps=reset_num_timesteps, progress_bar=progress_bar
+        )
         needed_env(self, "learn")
         self.take_over_changes()
         with self.during_learn:

@@ -14,7 +14,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_dreamer_urlb.number_checks import check_switch
+from sb3_dreamer_urlb.algorithm.prediction_checks import checked_starts, checked_state, observed
+from sb3_dreamer_urlb.number_checks import check_switch, plain
 from sb3_dreamer_urlb.snapshots import policy as policy_snapshot
 from sb3_dreamer_urlb.snapshots.archive import Target
 from sb3_dreamer_urlb.spaces.actions import Actions, make_actions
@@ -58,6 +59,7 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     #: from an observation space, and ``normalize_images``, to what the agent sees; raises UnsupportedSpaceError
     kind_of_observations: ClassVar[Callable[..., Observations]] = Images
     agent: nn.Module
+    _types: tuple[np.dtype[Any], ...] | None = None
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], normalize_images: bool):
         check_switch("policy_kwargs: normalize_images", normalize_images)
@@ -164,15 +166,19 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
             states and plans, then comes from the environments' step counts, which travel in ``state``: equal inputs give
             equal actions, the steps of an episode draw independently, and the global generators stay untouched
         :return: action(s) in the action space, and the memory for the next call: arrays with leading n (1 if unbatched)
+        :raises ValueError: for an observation out of its space, and a state, starts or a switch that cannot be meant
         """
+        check_switch("deterministic", deterministic := plain(deterministic))
         self.set_training_mode(False)
         tensor, vectorized = self.obs_to_tensor(checked_observation(observation, self.observation_space))
         self.observations.check(tensor)
-        n = batch_size(tensor)
-        memory = self.initial_state(n) if state is None else self._memory(state, n)
-        starts = np.zeros(n, bool) if episode_start is None else np.array(episode_start, bool).reshape(-1)
-        if len(starts) != n:
-            raise ValueError(f"episode_start has {len(starts)} entries for {n} observation(s).")
+        n = observed(tensor)
+        if state is None:
+            memory = self.initial_state(n)
+        else:
+            state = checked_state(state, n, self.memory_shapes(), self._memory_types())
+            memory = self._memory_of([th.as_tensor(part, device=self.device) for part in state])
+        starts = checked_starts(episode_start, n)
         generator = self._generator_of(state, starts) if deterministic else None
         is_first = th.as_tensor(starts | (state is None), device=self.device)
         with th.no_grad():
@@ -180,6 +186,12 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
         action = self.to_env_action(memory.action.cpu().numpy())
         # An array in any case, as SB3's: indexing would make a scalar of a single choice.
         return action if vectorized else action.squeeze(0), memory.to_numpy()
+
+    def _memory_types(self) -> tuple[np.dtype[Any], ...]:
+        """Of the arrays in ``predict(state=…)``."""
+        if self._types is None:
+            self._types = tuple(part.dtype for part in self.initial_state(1).to_numpy())
+        return self._types
 
     def _generator_of(self, state: tuple[np.ndarray, ...] | None, starts: np.ndarray) -> th.Generator | None:
         """What a deterministic prediction draws from; None for agents that draw nothing.
@@ -192,25 +204,6 @@ class AgentPolicy(BasePolicy, Generic[AnyMemory]):
     def to_env_action(self, action: np.ndarray) -> np.ndarray:
         """From the agent's actions, (n, A), to the action space's bounds, shape and dtype."""
         return self.actions.to_env(action)
-
-    def _memory(self, state: tuple[np.ndarray, ...], n: int) -> AnyMemory:
-        shapes = self.memory_shapes()
-        if not isinstance(state, tuple) or len(state) != len(shapes):
-            got = f"a tuple of {len(state)}" if isinstance(state, tuple) else type(state).__name__
-            raise ValueError(f"state must be what the last predict() returned, a tuple of {len(shapes)} arrays, got {got}.")
-        found = [np.shape(part) for part in state]
-        if any(len(shape) == 0 or shape[0] != n for shape in found):
-            whose = " or ".join(map(str, dict.fromkeys((*shape, 0)[0] for shape in found)))
-            raise ValueError(f"state is for {whose} environments, the observation for {n}.")
-        expected = [its[1:] if shape is None else shape for its, shape in zip(found, shapes, strict=True)]
-        if [its[1:] for its in found] != expected:
-            raise ValueError(
-                f"state must be what the last predict() of this policy returned, arrays of the shapes "
-                f"{[(n, *shape) for shape in expected]}, got {found}."
-            )
-        # Copies only what torch does not take, as arrays that nobody may write to.
-        parts = [part if isinstance(part, th.Tensor) else np.require(part, requirements="W") for part in state]
-        return self._memory_of([th.as_tensor(part, device=self.device) for part in parts])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = batch_size(observation)

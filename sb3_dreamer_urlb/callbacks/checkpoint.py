@@ -13,6 +13,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
+from sb3_dreamer_urlb.callbacks.placing import BetweenRolloutsCallback
 from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.runs import evaluation_history
@@ -21,7 +22,7 @@ from sb3_dreamer_urlb.runs.run_folder import RunFolder
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
 
-class RunCheckpointCallback(WithKnownKeywords, ResumingCallback):
+class RunCheckpointCallback(WithKnownKeywords, BetweenRolloutsCallback, ResumingCallback):
     """Keep a run in a folder, so that it can go on after whatever killed it.
 
     With ``resume="auto"`` the same script, started again, does so: when ``learn`` begins and the folder holds a checkpoint,

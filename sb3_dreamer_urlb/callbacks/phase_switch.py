@@ -9,12 +9,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.checks import check_kept
+from sb3_dreamer_urlb.callbacks.placing import BetweenRolloutsCallback
 from sb3_dreamer_urlb.number_checks import is_integer, plain
 from sb3_dreamer_urlb.phases import PRETRAINING
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
 
 
-class PhaseSwitchCallback(WithKnownKeywords, BaseCallback):
+class PhaseSwitchCallback(WithKnownKeywords, BetweenRolloutsCallback):
     """Turn a run from pre-training to fine-tuning inside one ``model.learn(...)``.
 
     The switch happens at the end of the rollout in which the phase's frames are reached, unless ``learn`` ends with it:

@@ -231,6 +231,8 @@ def test_their_parts_are_named(algorithm, policy, replay, method, kwargs, messag
             for value in ("5", float("nan"), None, [5], True, -3)
         ),
         *(({"callback": value}, "callback must be a .*, got") for value in ("eval", BaseCallback, [5], [print])),
+        ({"reset_num_timesteps": "no"}, "reset_num_timesteps must be True or False, got 'no'"),
+        ({"progress_bar": 1}, "progress_bar must be True or False, got 1"),
         *(({"log_interval": value}, "log_interval must be an integer of at least 1") for value in (0, -1, "4", 2.5)),
     ],
 )

@@ -7,12 +7,20 @@ import pytest
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from told import told_meanwhile
 
-from sb3_dreamer_urlb import DreamerPolicy, DreamerV2, FineTuneCallback, PhaseSwitchCallback, SnapshotCallback
+from sb3_dreamer_urlb import (
+    DreamerPolicy,
+    DreamerV2,
+    FineTuneCallback,
+    PhaseSwitchCallback,
+    RunCheckpointCallback,
+    SnapshotCallback,
+)
+from sb3_dreamer_urlb.callbacks.placing import BetweenRolloutsCallback
 from sb3_dreamer_urlb.dreamer_v2.kept_parts import TRANSFER
 from sb3_dreamer_urlb.transfer_rule import ACTOR_CHOICE, CRITIC_CHOICE, FRESH, KEPT, keeps_actor
 
@@ -448,3 +456,35 @@ def test_a_snapshot_is_fine_tuned_by_the_papers_flow(tiny_model, tmp_path):
 def test_bad_frames_of_snapshots(frames, tmp_path):
     with pytest.raises(ValueError, match="sequence of positive integers"):
         SnapshotCallback(tmp_path, frames)
+
+
+# -- where callbacks are given ---------------------------------------------------------------------------------------------
+
+BETWEEN_ROLLOUTS = {
+    "PhaseSwitchCallback": lambda folder: PhaseSwitchCallback(40),
+    "RunCheckpointCallback": lambda folder: RunCheckpointCallback(folder),
+}
+
+
+@pytest.mark.parametrize("listed", [False, True], ids=["alone", "in a list"])
+@pytest.mark.parametrize("which", BETWEEN_ROLLOUTS)
+def test_what_would_hear_nothing_below_events_is_refused_there(tiny_model, tmp_path, which, listed):
+    callback = BETWEEN_ROLLOUTS[which](tmp_path)
+    below = CallbackList([callback]) if listed else callback
+    model = tiny_model(vec_env(), intrinsic_reward="lbs")
+    with pytest.raises(ValueError, match=rf"{which} must be given to learn\(\) itself.*: EveryNTimesteps calls it only"):
+        model.learn(120, callback=EveryNTimesteps(10, below))
+
+
+def test_all_that_act_between_rollouts_are_refused_there():
+    def subclasses(kind):
+        yield from (sub for one in kind.__subclasses__() for sub in (one, *subclasses(one)))
+
+    def overrides(kind):
+        return any(getattr(kind, name) is not getattr(BaseCallback, name) for name in ("_on_rollout_start", "_on_rollout_end"))
+
+    needing = {
+        kind for kind in subclasses(BaseCallback) if kind.__module__.startswith("sb3_dreamer_urlb.") and overrides(kind)
+    }
+    assert needing == {PhaseSwitchCallback, RunCheckpointCallback}
+    assert all(issubclass(kind, BetweenRolloutsCallback) for kind in needing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from itertools import pairwise
 
@@ -118,7 +119,7 @@ def test_acting_never_asks_the_device_for_a_value(acting, observations, monkeypa
     policy, obs = acting.policy, observations(2)
     _, state = acting.predict(obs, deterministic=True)
     tensor, _ = policy.obs_to_tensor(obs)
-    memory, starts = policy._memory(state, 2), th.tensor([False, True])
+    memory, starts = policy._memory_of([th.as_tensor(part) for part in state]), th.tensor([False, True])
 
     def step():
         generator = policy._generator_of(state[-1], np.array([False, True]))
@@ -253,6 +254,14 @@ def test_prediction_in_mid_training_changes_nothing(tiny_model, observations, we
         (lambda obs, state: (obs[:1], state), r"state is for 2 environments, .* for 1"),
         (lambda obs, state: (obs, state, np.ones(3, bool)), "episode_start has 3 entries for 2"),
         (lambda obs, state: (obs, None, np.ones(1, bool)), "episode_start has 1 entries for 2"),
+        (lambda obs, state: (obs, None, np.array(["False", "no"])), "episode_start must be true or false .*'no'"),
+        (lambda obs, state: (obs, None, [np.nan, 0]), "episode_start must be true or false .*nan"),
+        (lambda obs, state: (obs, None, None, "no"), "deterministic must be True or False, got 'no'"),
+        (lambda obs, state: (obs, (state[0] * np.nan, *state[1:])), "part 0 holds finite numbers, got float32"),
+        (lambda obs, state: (obs, (*state[:-1], np.array([-3, 0]))), "part 5 holds whole numbers of at least 0, got int64"),
+        (lambda obs, state: (obs, (*state[:-1], np.array([0.5, 0]))), "part 5 holds whole numbers of at least 0, got float64"),
+        (lambda obs, state: (obs, (*state[:-1], np.array([0, "1"], object))), "part 5 holds whole numbers"),
+        (lambda obs, state: (obs[:0],), "of no environment"),
     ],
 )
 def test_wrong_input_is_refused(tiny_model, observations, arguments, message):
@@ -260,6 +269,24 @@ def test_wrong_input_is_refused(tiny_model, observations, arguments, message):
     state = model.predict(obs)[1]
     with pytest.raises(ValueError, match=message):
         model.predict(*arguments(obs, state))
+
+
+def test_a_state_may_come_from_json(tiny_model, observations):
+    model, obs = tiny_model(planner="dyna_mpc"), observations(2)
+    model.policy.planning = True
+    state = model.predict(obs, deterministic=True)[1]
+    expected = model.predict(obs, state, deterministic=True)
+    again = tuple(json.loads(json.dumps([part.tolist() for part in state])))
+    for given in (again, tuple(part.astype(float) for part in state), tuple(map(th.as_tensor, state))):
+        action, after = model.predict(obs, given, [0, 0], deterministic=True)
+        assert np.array_equal(action, expected[0]) and _equal_states(after, expected[1])
+
+
+def test_parts_for_unequally_many_environments_are_refused(tiny_model):
+    space = spaces.Dict({"arm": spaces.Box(-1, 1, (3,), np.float32), "leg": spaces.Box(-1, 1, (2,), np.float32)})
+    model = DreamerV2("MultiInputPolicy", CounterEnv(observation_space=space), preset="tiny")
+    with pytest.raises(ValueError, match=r"equally many environments, got \{'arm': 2, 'leg': 3\}"):
+        model.predict({"arm": np.zeros((2, 3), np.float32), "leg": np.zeros((3, 2), np.float32)})
 
 
 def test_a_wrong_image_size_is_refused(tiny_model):
