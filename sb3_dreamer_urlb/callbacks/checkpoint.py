@@ -84,7 +84,7 @@ class RunCheckpointCallback(WithKnownKeywords, BetweenRolloutsCallback, Resuming
         self._saved = None if run.identity is None else self._state()
         self.received = None
         if self.evaluation is not None and run.evaluation is not None:
-            evaluation_history.restore(self.evaluation, run.evaluation)
+            evaluation_history.restore(self.evaluation, run.evaluation, model.num_timesteps)
             run.evaluation = None
         if self.handle_signals and threading.current_thread() is threading.main_thread():
             model.during_learn.enter_context(self._watching())

@@ -15,9 +15,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from whole_runs import RepeatingEnv, crash, everything, scramble, vec_env
 
-from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
+from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard
+from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
+from sb3_dreamer_urlb.zoo.callbacks import BestOfPhase
 
 # -- resume="auto" ---------------------------------------------------------------------------------------------------------
 
@@ -95,7 +97,7 @@ def test_what_is_due_every_so_many_steps_stays_so(tiny_model, tmp_path):
     "change",
     [
         {"best_mean_reward": "high"},
-        {"best_mean_reward": None},
+        {"best_mean_reward": [1.0]},
         {"n_calls": 1.5},
         {"results": [1.0]},
         {"timesteps": [[1]]},
@@ -110,6 +112,51 @@ def test_damaged_evaluations_are_refused(tiny_model, tmp_path, change):
     change_data(file, file, lambda data: data["run"]["evaluation"].update(change))
     with pytest.raises(SnapshotError, match="evaluation is damaged"):
         DreamerV2.resume(tmp_path, vec_env())
+
+
+# Before the first evaluation, in the first phase, between the switch and the second phase's first evaluation, after that.
+@pytest.mark.parametrize(("until", "remembered"), [(25, True), (45, True), (65, True), (65, False), (85, True)])
+@pytest.mark.parametrize("ours", [True, False], ids=["EvaluationCallback", "EvalCallback"])
+def test_evaluations_of_a_run_that_goes_on_are_those_of_a_whole_one(
+    tiny_model, tmp_path, monkeypatch, until, ours, remembered
+):
+    if not remembered:
+        monkeypatch.setattr(evaluation_history, "MAX_NUMBERS", 0)
+
+    def callbacks(folder, n_eval_episodes=2):
+        kwargs = {"n_eval_episodes": n_eval_episodes, "verbose": 0, "log_path": str(folder), "warn": False}
+        if ours:
+            evaluation = EvaluationCallback(vec_env(), every_frames=30, pretraining=True, **kwargs)
+            before = []
+        else:
+            evaluation = EvalCallback(vec_env(), eval_freq=30, **kwargs)
+            before = [BestOfPhase(evaluation)]
+        keep = RunCheckpointCallback(folder / "run", 10, evaluation=evaluation, resume="auto")
+        return evaluation, [PhaseSwitchCallback(60), *before, evaluation, keep]
+
+    def model():
+        return tiny_model(vec_env(), intrinsic_reward="lbs")
+
+    def of(folder):
+        with np.load(folder / "evaluations.npz") as file:
+            return {name: file[name].tolist() for name in file}
+
+    scramble()
+    evaluation, whole = callbacks(tmp_path / "whole")
+    model().learn(130, callback=whole)
+    best = evaluation.best_mean_reward
+    crash(model(), until, 130, callbacks(tmp_path / "cut")[1])
+    evaluation, rest = callbacks(tmp_path / "cut")
+    model().learn(130, callback=rest)
+    assert of(tmp_path / "cut") == of(tmp_path / "whole") and evaluation.best_mean_reward == best
+    # One file has equally many episodes each: what is there stays, under another name.
+    if until > 30:
+        before = of(tmp_path / "cut")
+        with pytest.warns(UserWarning, match="evaluations of another number of episodes than 1"):
+            model().learn(190, callback=callbacks(tmp_path / "cut", n_eval_episodes=1)[1])
+        with np.load(tmp_path / "cut" / "evaluations_before_1.npz") as file:
+            assert {name: file[name].tolist() for name in file} == before
+        assert all(len(row) == 1 for row in of(tmp_path / "cut")["results"])
 
 
 # -- VecNormalize ----------------------------------------------------------------------------------------------------------
