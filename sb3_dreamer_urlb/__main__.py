@@ -7,12 +7,11 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from sb3_dreamer_urlb.cli.mistakes import ending_in_a_line
-from sb3_dreamer_urlb.command_parser import CommandParser, at_least
+from sb3_dreamer_urlb.command_parser import CommandParser, a_path, a_seed, at_least
 from sb3_dreamer_urlb.output_reader import ending_with_its_reader
 from sb3_dreamer_urlb.version import __version__
 
@@ -82,12 +81,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _demo_pixels_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_pixels_output)")
+    parser.add_argument("--out", type=a_path, help="folder for everything that is written (default: demo_pixels_output)")
     _small_run_arguments(parser)
 
 
 def _methods_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, help="folder of the snapshots (default: methods_output)")
+    parser.add_argument("--out", type=a_path, help="folder of the snapshots (default: methods_output)")
     parser.add_argument("--methods", nargs="+", help="which (default: all)")
     parser.add_argument("--jobs", type=at_least(1), help="methods at a time (default: 2)")
     _small_run_arguments(parser)
@@ -95,7 +94,7 @@ def _methods_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _small_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", help="for example walker-walk (default: walker-stand)")
-    parser.add_argument("--seed", type=at_least(0))
+    parser.add_argument("--seed", type=a_seed)
     parser.add_argument("--pretrain-frames", type=at_least(0))
     parser.add_argument("--finetune-frames", type=at_least(1))
     parser.add_argument("--episodes", type=at_least(1), help="evaluation episodes")
@@ -103,8 +102,8 @@ def _small_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _convert_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("old", type=Path)
-    parser.add_argument("new", type=Path)
+    parser.add_argument("old", type=a_path)
+    parser.add_argument("new", type=a_path)
     parser.add_argument("--trust", action="store_true", help="yes, whoever made OLD may run code on this machine")
 
 

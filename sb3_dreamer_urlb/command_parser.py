@@ -6,15 +6,20 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from sb3_dreamer_urlb.unknown_names import did_you_mean
 
+#: of numpy's generators, as Stable-Baselines3 seeds them
+MOST_SEED = 2**32 - 1
 
-def at_least(least: int) -> Callable[[str], int]:
-    """The type of an option that counts something, or seeds it.
+
+def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
+    """The type of an option that counts something, or numbers it.
 
     :param least: smallest value
+    :param most: largest value; None for none
     """
 
     def integer(text: str) -> int:
@@ -22,11 +27,24 @@ def at_least(least: int) -> Callable[[str], int]:
             value = int(text)
         except ValueError:
             value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"must be an integer of at least {least}, got {text!r}.")
+        if value < least or (most is not None and value > most):
+            end = "" if most is None else f" and at most {most}"
+            raise argparse.ArgumentTypeError(f"must be an integer of at least {least}{end}, got {text!r}.")
         return value
 
     return integer
+
+
+def a_seed(text: str) -> int:
+    """The type of an option that seeds something."""
+    return at_least(0, MOST_SEED)(text)
+
+
+def a_path(text: str) -> Path:
+    """The type of an option that is a file or folder; an empty text is a variable that was not set, not the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"must be the path of a file or folder, got {text!r}.")
+    return Path(text)
 
 
 def with_near_choices(message: str) -> str:

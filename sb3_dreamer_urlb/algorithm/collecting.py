@@ -41,6 +41,8 @@ class CollectingAlgorithm(SavingAlgorithm):
     action_repeat: int
     #: faults that environments' guards reported so far
     env_faults: int
+    #: ``<domain>-<task>`` of the present environment
+    _task: str | None = None
     #: see ``last_touches``; as of when the model itself last reset or stepped its environments
     _touches: tuple[int, ...] = ()
     #: see :meth:`_drawn_through`
@@ -109,6 +111,8 @@ class CollectingAlgorithm(SavingAlgorithm):
             "You must use only one env when doing episodic training."
         )
         self.policy.set_training_mode(False)
+        if not phases.PHASES[self.phase].explores:
+            self.learnt_task = self._task
         going_on_in = env.venv if isinstance(env, LearningVecEnv) else env
         num_collected_steps, num_collected_episodes = 0, 0
         continue_training = True

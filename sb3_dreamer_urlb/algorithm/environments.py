@@ -14,6 +14,7 @@ from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
 from sb3_dreamer_urlb.algorithm.environment_checks import check_env
 from sb3_dreamer_urlb.envs.facts import env_fact
+from sb3_dreamer_urlb.envs.naming import task_of
 from sb3_dreamer_urlb.envs.normalized import watch_ends
 from sb3_dreamer_urlb.envs.touches import last_touches
 
@@ -85,4 +86,5 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
             watch_ends(self._vec_normalize_env)
         self.action_repeat = env_fact(self.env, "action_repeat", 1)
         self.domain = env_fact(self.env, "domain", None)
+        self._task = task_of(self.env)
         advice.warn_if_no_episode_fits(self)

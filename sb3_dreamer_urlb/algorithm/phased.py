@@ -94,6 +94,8 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
         self.action_repeat = 1
         #: of the environment's task, None where it does not tell
         self.domain = None
+        #: ``<domain>-<task>`` whose rewards it has learnt from last; None before
+        self.learnt_task = None
         #: faults that environments' guards reported so far
         self.env_faults = 0
         self.run_folder = None

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, a_seed, at_least
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -24,7 +24,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
     parser.add_argument("--episodes", type=at_least(1), default=10, help="(default: %(default)s)")
     parser.add_argument("--envs", type=at_least(1), help="environments at a time (default: as many as episodes, at most 10)")
-    parser.add_argument("--seed", type=at_least(0), default=1000, help="of the first episode (default: %(default)s)")
+    parser.add_argument("--seed", type=a_seed, default=1000, help="of the first episode (default: %(default)s)")
 
 
 def add_statistics_argument(parser: argparse.ArgumentParser, whose: str = "") -> None:
@@ -35,7 +35,7 @@ def add_statistics_argument(parser: argparse.ArgumentParser, whose: str = "") ->
     """
     parser.add_argument(
         f"--{whose}-vec-normalize" if whose else "--vec-normalize",
-        type=Path,
+        type=a_path,
         help=f"statistics of the {whose + ' ' if whose else ''}observations, JSON (default: a run folder's own, or "
         "NAME.vec_normalize.json beside NAME.zip)",
     )
@@ -85,6 +85,17 @@ def _hinting_at_states(env: VecEnv) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def _telling_the_arguments(kwargs: dict[str, Any]) -> Iterator[None]:
+    """A value of the wrong kind is what makes an environment's own code, or Gymnasium's, raise a TypeError."""
+    try:
+        yield
+    except TypeError as error:
+        if not kwargs:
+            raise
+        raise ValueError(f"The environment cannot be made with --env-kwargs {kwargs}: {error}") from error
+
+
 def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
     """An environment as a saved agent knows it, without the agent.
 
@@ -99,7 +110,7 @@ def environment_of(options: dict[str, Any], envs: int) -> VecEnv:
 
     kwargs = {name: typed(value) for name, value in pairs("--env-kwargs", options.get("env_kwargs", ())).items()}
     snapshot = _file(options["snapshot"])
-    with naming_near_ids(options["env"]):
+    with naming_near_ids(options["env"]), _telling_the_arguments(kwargs):
         env = make_vec_env(options["env"], envs, env_kwargs=kwargs)
     try:
         statistics = options.get("vec_normalize") or (beside(snapshot) if beside(snapshot).is_file() else None)
@@ -131,14 +142,15 @@ def pairs(option: str, texts: Any) -> dict[str, str]:
 
     :param option: for the message
     :param texts: as they were given
-    :raises ValueError: for another form
+    :raises ValueError: for another form, and for a name that is there twice
     """
-    found = {}
+    found: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"{option}: expected NAME=VALUE, got {text!r}.")
-        found[name] = value
+        if found.setdefault(name, value) != value:
+            raise ValueError(f"{option}: {name} is given twice, as {found[name]!r} and as {value!r}.")
     return found
 
 

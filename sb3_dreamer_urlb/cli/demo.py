@@ -6,10 +6,9 @@ Walker from states, one agent a core. The agent that explored ships with this pa
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, a_seed, at_least
 
 HELP = "learn a walker task with and without pre-training, side by side, and show the difference"
 
@@ -18,9 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("--out", type=Path, help="folder for everything that is written (default: demo_output)")
+    parser.add_argument("--out", type=a_path, help="folder for everything that is written (default: demo_output)")
     parser.add_argument("--task", help="of the walker: flip, run, walk, stand (default: flip)")
-    parser.add_argument("--seed", type=at_least(0), help="of everything random (default: 0)")
+    parser.add_argument("--seed", type=a_seed, help="of everything random (default: 0)")
     parser.add_argument("--finetune-frames", type=at_least(1), help="frames that each agent learns from (default: 20000)")
     parser.add_argument(
         "--pretrain-frames",

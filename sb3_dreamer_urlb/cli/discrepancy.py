@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.cli.oracle import add_oracle_arguments, check_oracle_options, print_values, trajectories_of
+from sb3_dreamer_urlb.command_parser import a_path
 
 HELP = "how much fine-tuning changed the model's predictions, along an oracle's trajectories"
 
@@ -15,8 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("pretrained", type=Path, help="snapshot before the fine-tuning")
-    parser.add_argument("finetuned", type=Path, help="snapshot after it, its decoder frozen")
+    parser.add_argument("pretrained", type=a_path, help="snapshot before the fine-tuning")
+    parser.add_argument("finetuned", type=a_path, help="snapshot after it, its decoder frozen")
     add_oracle_arguments(parser)
 
 

@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, at_least
 from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.tables import Table
 
 TABLES = ("summary", "raw_scores", "improvement", "correlation")
+#: repetitions of the bootstrap that an interval needs
+FEW = 100
 HELP = "turn rows of evaluations into the paper's tables and figures"
 
 
@@ -29,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("rows", type=Path, nargs="+", metavar="ROWS.csv", help="what evaluate and EvaluationCallback wrote")
-    parser.add_argument("--out", type=Path, required=True, help="folder, made if it is not there")
+    parser.add_argument("rows", type=a_path, nargs="+", metavar="ROWS.csv", help="what evaluate and EvaluationCallback wrote")
+    parser.add_argument("--out", type=a_path, required=True, help="folder, made if it is not there")
     parser.add_argument("--finetune-frames", help="budget of fine-tuning, such as 100k (default: 100k, or what was reached)")
     parser.add_argument("--pretrain-frames", help="length of the pre-training (default: 2M, or the longest there is)")
     choices = ("dreamer_2m", "urlb_expert")
@@ -82,6 +84,8 @@ def run(options: dict[str, Any]) -> int:
             budgets[name] = frames(f"--{name}-frames", text)
             check_integer(f"--{name}-frames", budgets[name], 1)
     study = Study(rows, **budgets, normalizer=options["normalizer"])
+    if options["repetitions"] < FEW:
+        print(f"--repetitions {options['repetitions']}: intervals of fewer than {FEW} are accidental.", file=sys.stderr)
     for warning in study.mixtures():
         print(f"These are averaged: {warning}", file=sys.stderr)
     if study.unfinished:

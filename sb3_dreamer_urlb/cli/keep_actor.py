@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.cli.agents import add_statistics_argument
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, a_seed, at_least
 
 HELP = "measure whether fine-tuning should keep the pre-trained actor"
 
@@ -16,11 +15,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("snapshot", type=Path, help="pre-trained")
+    parser.add_argument("snapshot", type=a_path, help="pre-trained")
     parser.add_argument("--env", required=True, help="id of the task's environment, such as urlb/walker-run-v0")
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
     parser.add_argument("--episodes", type=at_least(1), default=5, help="with each actor (default: %(default)s)")
-    parser.add_argument("--seed", type=at_least(0), default=3000, help="of the first episode (default: %(default)s)")
+    parser.add_argument("--seed", type=a_seed, default=3000, help="of the first episode (default: %(default)s)")
     add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 

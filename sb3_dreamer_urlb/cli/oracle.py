@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb.cli.agents import add_statistics_argument
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, a_seed, at_least
 from sb3_dreamer_urlb.folders import made_folder
 
 if TYPE_CHECKING:
@@ -20,13 +19,13 @@ def add_oracle_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("--env", required=True, help="id of the task's environment, such as urlb/walker-run-v0")
     parser.add_argument("--env-kwargs", nargs="+", metavar="NAME=VALUE", help="arguments of the environment")
-    parser.add_argument("--oracle", type=Path, help="snapshot of an agent that has learnt the task: it plays")
-    parser.add_argument("--trajectories", type=Path, help="folder of recorded episodes; with --oracle they are written there")
+    parser.add_argument("--oracle", type=a_path, help="snapshot of an agent that has learnt the task: it plays")
+    parser.add_argument("--trajectories", type=a_path, help="folder of recorded episodes; --oracle writes them there")
     add_statistics_argument(parser)
     add_statistics_argument(parser, "oracle")
     parser.add_argument("--count", type=at_least(1), default=30, help="trajectories (default: %(default)s, the paper's)")
-    parser.add_argument("--seed", type=at_least(0), default=2000, help="of the first trajectory (default: %(default)s)")
-    parser.add_argument("--rows", type=Path, help="CSV file of evaluations: the number is written beside this agent's")
+    parser.add_argument("--seed", type=a_seed, default=2000, help="of the first trajectory (default: %(default)s)")
+    parser.add_argument("--rows", type=a_path, help="CSV file of evaluations: the number is written beside this agent's")
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 
 

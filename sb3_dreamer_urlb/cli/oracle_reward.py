@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.cli.oracle import add_oracle_arguments, check_oracle_options, print_values, trajectories_of
+from sb3_dreamer_urlb.command_parser import a_path
 
 HELP = "how interesting a pre-trained agent finds an oracle's trajectories"
 
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("snapshot", type=Path, help="pre-trained, not fine-tuned")
+    parser.add_argument("snapshot", type=a_path, help="pre-trained, not fine-tuned")
     add_oracle_arguments(parser)
 
 

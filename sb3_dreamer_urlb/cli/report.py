@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_dreamer_urlb.command_parser import a_path
 from sb3_dreamer_urlb.folders import check_file
 
 HELP = "write one HTML page about a run"
@@ -15,9 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("run", type=Path, help="folder of a run, of the demo, or any with a snapshot or logs in it")
-    parser.add_argument("--out", type=Path, help="page (default: report.html in the folder)")
-    parser.add_argument("--rows", type=Path, nargs="+", default=[], help="evaluations beside those in the folder")
+    parser.add_argument("run", type=a_path, help="folder of a run, of the demo, or any with a snapshot or logs in it")
+    parser.add_argument("--out", type=a_path, help="page (default: report.html in the folder)")
+    parser.add_argument("--rows", type=a_path, nargs="+", default=[], help="evaluations beside those in the folder")
     parser.add_argument(
         "--command", dest="repeat", help="what repeats the run (default: the zoo's command, or the constructor's call)"
     )

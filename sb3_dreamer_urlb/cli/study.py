@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, at_least
 
 HELP = "list the runs of one of the paper's ablations, and do those that are missing"
 #: options that change the paper's plan
@@ -20,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("name", choices=NAMES, help="which ablation")
     parser.add_argument("action", choices=("list", "run"), help="say what is done and what is missing, or do it")
-    parser.add_argument("--folder", type=Path, required=True, help="of the study: rows.csv, snapshots, runs under way")
+    parser.add_argument("--folder", type=a_path, required=True, help="of the study: rows.csv, snapshots, runs under way")
     parser.add_argument("--methods", nargs="+", help="intrinsic rewards (default: the paper's)")
     parser.add_argument("--tasks", nargs="+", help="such as walker-run (default: the paper's)")
     parser.add_argument("--scratch", action="store_true", help="beside it, agents that learn each task without pre-training")

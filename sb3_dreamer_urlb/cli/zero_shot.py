@@ -13,7 +13,7 @@ from sb3_dreamer_urlb.cli.agents import (
     environments_at_a_time,
     load_agent,
 )
-from sb3_dreamer_urlb.command_parser import at_least
+from sb3_dreamer_urlb.command_parser import a_path, at_least
 from sb3_dreamer_urlb.folders import check_file
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: of this command
     """
-    parser.add_argument("snapshot", type=Path, help="pre-trained, in the environment of the task or with its reward")
+    parser.add_argument("snapshot", type=a_path, help="pre-trained, in the environment of the task or with its reward")
     add_evaluation_arguments(parser)
     parser.add_argument(
         "--planner",
@@ -38,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--finetune-frames", type=at_least(0), default=0, help="then fine-tune so long, and evaluate again (paper: 100000)"
     )
     parser.add_argument("--freeze-decoder", action="store_true", help="while fine-tuning, for the latent dynamics discrepancy")
-    parser.add_argument("--save", type=Path, help="snapshot of the fine-tuned model")
-    parser.add_argument("--rows", type=Path, help="CSV file that the rows are added to")
+    parser.add_argument("--save", type=a_path, help="snapshot of the fine-tuned model")
+    parser.add_argument("--rows", type=a_path, help="CSV file that the rows are added to")
     add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
 

@@ -12,10 +12,9 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dreamer_urlb.envs.facts import env_attribute
-from sb3_dreamer_urlb.envs.told import CLASS
+from sb3_dreamer_urlb.envs.naming import task_columns
 from sb3_dreamer_urlb.evaluation.episodes import Evaluation
-from sb3_dreamer_urlb.evaluation.names import columns_of_id
-from sb3_dreamer_urlb.evaluation.rows import CHANGED, REQUIRED, Row
+from sb3_dreamer_urlb.evaluation.rows import ACTING, CHANGED, LEARNT, REQUIRED, Row
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.snapshots import values
 
@@ -45,6 +44,7 @@ def row_of(
     :param columns: further columns, or other values for required ones
     """
     facts = {**env_columns(env), **agent_columns(model, keep_actor, keep_critic)}
+    facts |= _what_was_played(model, facts, evaluation)
     facts |= {
         "planner": evaluation.planner,
         "return_mean": evaluation.mean,
@@ -59,6 +59,22 @@ def row_of(
     }
     further = {name: str(facts.pop(name)) for name in list(facts) if name not in REQUIRED}
     return Row(**facts, further=further)
+
+
+def _what_was_played(model: Any, facts: dict[str, Any], evaluation: Evaluation) -> dict[str, str]:
+    """Columns that keep a row out of the benchmark's tables: an agent of another task, or one that draws its actions."""
+    here, learnt = f"{facts['domain']}-{facts['task']}", getattr(model, "learnt_task", None)
+    others = {LEARNT: learnt} if facts["finetune_frames"] > 0 and learnt not in (None, here) else {}
+    return {**others, **({} if evaluation.deterministic else {ACTING: "stochastic"})}
+
+
+def was_fine_tuned(model: Any) -> bool:
+    """Whether a model is past a pre-training.
+
+    :param model: any of Stable-Baselines3
+    """
+    exploring = PHASES[model.phase].explores if hasattr(model, "phase") else False
+    return not exploring and int(getattr(model, "pretrained_frames", 0)) > 0
 
 
 def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool | None = None) -> dict[str, Any]:
@@ -77,7 +93,7 @@ def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool 
         method = FROM_SCRATCH.get(algorithm, algorithm.lower())
     else:
         method = reward if isinstance(reward, str) else getattr(reward, "__name__", type(reward).__name__)
-    tuned = pretrained > 0 and not exploring
+    tuned = was_fine_tuned(model)
     kept = getattr(model, "kept", None) or {}
     return {
         "method": method,
@@ -98,15 +114,8 @@ def env_columns(env: VecEnv) -> dict[str, Any]:
     :param env: vectorised
     """
     spec = env_attribute(env, "spec", None)
-    columns: dict[str, Any] = {} if spec is None else dict(columns_of_id(spec.id))
+    columns: dict[str, Any] = dict(task_columns(env))
     given = {} if spec is None else spec.kwargs
-    if columns.get("domain", "gymnasium") == "gymnasium":
-        # An id without a domain of its own: what the environment says counts.
-        said = {name: given.get(name, env_attribute(env, name, None)) for name in ("domain", "task")}
-        columns |= {name: value for name, value in said.items() if isinstance(value, str) and value}
-    columns.setdefault("domain", "gymnasium")
-    if "task" not in columns:
-        columns["task"] = env_attribute(env, CLASS, type(env.unwrapped).__name__)
     if isinstance(given.get("observation"), str) and given["observation"] != "pixels":
         columns["observation"] = given["observation"]
     changed = {} if spec is None else {n: v for n, v in changed_arguments(spec).items() if n not in IN_OTHER_COLUMNS}

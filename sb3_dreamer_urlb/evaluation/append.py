@@ -13,30 +13,49 @@ from pathlib import Path
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, WRITTEN, Row, header, line_of, lines_of, parse, read_rows, texts
 from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.snapshots.atomic import written_atomically
+from sb3_dreamer_urlb.words import counted
 
 
 class RowsDisagree(ValueError):
     """Another result of the same run stands in the file already."""
 
 
-def check_can_append(path: str | os.PathLike[str]) -> None:
+def check_can_append(path: str | os.PathLike[str], rows: Iterable[Row] = ()) -> None:
     """Whether rows can be added to a file, before hours are spent on them. Its folder is made if it is not there.
 
     :param path: of the CSV file, there or not
+    :param rows: that will be added, their results still unknown
+    :raises RowsDisagree: if another evaluation of one of them stands there, of other episodes
     :raises ValueError: if it holds no rows
     :raises OSError: if it cannot be written
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give a CSV file for the rows.")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no file that rows can be kept in: give a CSV file.")
     made_folder("the folder of the rows", path.parent)
     with _locked(path):
+        content = b""
         if path.exists():
             # Not "w": what is there stays.
             with open(path, "ab"):
                 content = path.read_bytes()
             if content:
                 header(lines_of(content, "replace")[0], path)
+        known = {row.key: row for row in read_rows(path, strict=False).rows} if content else {}
+    for row in rows:
+        there = known.get(row.key, row)
+        if any(there[name] != row[name] for name in ("episodes", "evaluation_seed") if there[name] != ""):
+            raise _disagreement(path, there, f"{counted(row.episodes, 'episode')} from seed {row['evaluation_seed']} on")
+
+
+def _disagreement(path: Path, there: Row, now: object) -> RowsDisagree:
+    before = f"{there.return_mean:g} of {counted(there.episodes, 'episode')}"
+    return RowsDisagree(
+        f"{path} holds another result of the same run: {before}, now {now}. "
+        "A further column (arm=..., say) tells two runs apart; another file keeps both."
+    )
 
 
 def append_row(path: str | os.PathLike[str], row: Row) -> bool:
@@ -76,10 +95,7 @@ def append_rows(path: str | os.PathLike[str], rows: Iterable[Row]) -> int:
         for row in rows:
             other = known.setdefault(row.key, row)
             if other is not row and not other.agrees(row):
-                raise RowsDisagree(
-                    f"{path} holds another result of the same run: {other.return_mean:g} of {other.episodes} episodes, "
-                    f"now {row}. A further column (arm=..., say) tells two runs apart; another file keeps both."
-                )
+                raise _disagreement(path, other, row)
             if other is row:
                 now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
                 new.append({**texts(row), WRITTEN: row.further.get(WRITTEN, now)})
@@ -133,7 +149,9 @@ def _row_of(columns: list[str], line: str) -> tuple[dict[str, str], Row] | None:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    # A file of its own: the CSV is replaced when columns are added, and a lock would stay with the old one.
+    # A file of its own: the CSV is replaced when columns are added, and a lock would stay with the old one. One lock, whatever
+    # links lead to the file.
+    path = Path(os.path.realpath(path))
     with open(path.with_name(f".{path.name}.lock"), "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from sb3_dreamer_urlb.evaluation.aggregate import NEAR, Scores, final_rows, scores_of
 from sb3_dreamer_urlb.evaluation.names import METHODS, TASKS, method
-from sb3_dreamer_urlb.evaluation.rows import CHANGED, NONE, REQUIRED, Row
+from sb3_dreamer_urlb.evaluation.rows import NONE, REQUIRED, Row
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.transfer_rule import keeps_actor
@@ -51,7 +51,7 @@ class Arm:
 
 def standard(row: Row) -> bool:
     """Of the benchmark itself: no perturbation, no changed reward or task, reward unknown before fine-tuning."""
-    return not (row["perturbation"] or row["variant"] or row[CHANGED]) and row["known_reward"] != "true"
+    return row.is_of_the_benchmark and not (row["perturbation"] or row["variant"]) and row["known_reward"] != "true"
 
 
 def settled(rows: Iterable[Row]) -> Condition:
@@ -63,9 +63,8 @@ def settled(rows: Iterable[Row]) -> Condition:
     fixed = any(row.domain == "jaco" and row["variant"] == "fixed" for row in rows)
 
     def condition(row: Row) -> bool:
-        return not (row["perturbation"] or row[CHANGED]) and row["variant"] == (
-            "fixed" if fixed and row.domain == "jaco" else ""
-        )
+        variant = "fixed" if fixed and row.domain == "jaco" else ""
+        return row.is_of_the_benchmark and not row["perturbation"] and row["variant"] == variant
 
     return condition
 

@@ -8,7 +8,7 @@ from sb3_dreamer_urlb.evaluation.aggregate import Estimate, mean_and_error
 from sb3_dreamer_urlb.evaluation.arms import Arm, Study, acts, any_task, kept, plans, scratch
 from sb3_dreamer_urlb.evaluation.figure_parts import after, is_method, normalized, seeds, split_by, unscored
 from sb3_dreamer_urlb.evaluation.names import LEVELS, method
-from sb3_dreamer_urlb.evaluation.rows import CHANGED, Row
+from sb3_dreamer_urlb.evaluation.rows import Row
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, bars, finish, frames_label, new_figure
 
 
@@ -16,7 +16,7 @@ def perturbed(study: Study) -> Picture | None:
     """Paper, figure "RWRL tasks": fine-tuning in perturbed environments."""
 
     def changed(row: Row) -> bool:
-        return row["perturbation"] in LEVELS and not row[CHANGED]
+        return row["perturbation"] in LEVELS and row.is_of_the_benchmark
 
     tasks = sorted({(row.domain, row.task) for row in study.rows if changed(row)}, key=lambda one: (one[0] != "walker", one))
     if not tasks:
@@ -81,4 +81,4 @@ def sparsity(study: Study) -> Picture | None:
 
 
 def _jaco(row: Row) -> bool:
-    return row.domain == "jaco" and not (row["perturbation"] or row[CHANGED]) and row["variant"] != "fixed"
+    return row.domain == "jaco" and row.is_of_the_benchmark and not row["perturbation"] and row["variant"] != "fixed"

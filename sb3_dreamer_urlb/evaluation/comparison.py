@@ -13,6 +13,8 @@ from sb3_dreamer_urlb.evaluation.tables import Table, with_error
 from sb3_dreamer_urlb.unknown_names import did_you_mean
 
 POINTS = 100
+#: arguments in which the runs of one setting may differ
+OF_ONE_SETTING = {"seed", "tensorboard_log", "verbose"}
 #: tags of logs, in words
 IN_WORDS = {"eval/mean_reward": "return of evaluations", "rollout/ep_rew_mean": "return of training episodes"}
 
@@ -116,10 +118,27 @@ def _mean_at(curves: Sequence[np.ndarray], frames: float) -> Estimate:
     return Estimate(mean, mean - error, mean + error, 1, (len(curves), len(curves)))
 
 
+def mixtures(groups: Mapping[str, Sequence[RunFacts]]) -> list[str]:
+    """Groups whose runs are no seeds of one setting, each in a line: what they differ in, or a seed that is there twice.
+
+    :param groups: label → its runs
+    """
+    found = []
+    for label, members in groups.items():
+        known = [run for run in members if run.data]
+        facts = [{**run.arguments, "domain": run.data.get("domain"), "task": run.data.get("learnt_task")} for run in known]
+        names = sorted({name for one in facts for name in one} - OF_ONE_SETTING)
+        values = {name: list(dict.fromkeys(str(one.get(name)) for one in facts)) for name in names}
+        differ = [f"{name}={' / '.join(shown)}" for name, shown in values.items() if len(shown) > 1]
+        seeds = [one.get("seed") for one in facts if one.get("seed") is not None]
+        twice = dict.fromkeys(str(seed) for seed in seeds if seeds.count(seed) > 1)
+        differ += [f"seed {', '.join(twice)} more than once"] * bool(twice)
+        found += [f"{label}: {'; '.join(differ)}"] * bool(differ)
+    return found
+
+
 def _settings(groups: Mapping[str, Sequence[RunFacts]]) -> list[dict[str, str]]:
-    names = sorted(
-        {name for members in groups.values() for run in members for name in run.arguments} - {"seed", "tensorboard_log"}
-    )
+    names = sorted({name for members in groups.values() for run in members for name in run.arguments} - OF_ONE_SETTING)
     values = {name: {repr(run.arguments.get(name)) for members in groups.values() for run in members} for name in names}
     differ = [name for name in names if len(values[name]) > 1]
     rows = []

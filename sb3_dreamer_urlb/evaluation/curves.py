@@ -9,6 +9,7 @@ from sb3_dreamer_urlb.evaluation.aggregate import Estimate, mean_and_error
 from sb3_dreamer_urlb.evaluation.arms import Arm
 from sb3_dreamer_urlb.evaluation.figure_parts import REFERENCE_NAMES
 from sb3_dreamer_urlb.evaluation.names import ALIASES, TASKS
+from sb3_dreamer_urlb.evaluation.row import FALSE, NONE, TRUE
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row, frames, texts
 from sb3_dreamer_urlb.evaluation.scores import DREAMER_2M
 from sb3_dreamer_urlb.evaluation.style import COLUMN, PAGE, Picture, finish, frames_label, lines, new_figure
@@ -29,15 +30,18 @@ def selected(rows: Iterable[Row], text: str) -> Arm:
     """
     rows = list(rows)
     known = {*REQUIRED, *(name for row in rows for name in row.further)}
-    label, conditions = text, {}
+    if not text.strip():
+        raise ValueError("Expected COLUMN=VALUE, got no condition at all.")
+    label = text
+    conditions: dict[str, str] = {}
     for part in text.replace(",", " ").split():
         name, equals, value = part.partition("=")
         if not equals or (name not in known and name != "label"):
             raise ValueError(f"{text!r}: expected COLUMN=VALUE with a column of {', '.join(sorted(known))}, got {part!r}.")
         if name == "label":
             label = value.replace("_", " ")
-        else:
-            conditions[name] = _as_written(name, value)
+        elif conditions.setdefault(name, _as_written(name, value)) != _as_written(name, value):
+            raise ValueError(f"{text!r}: {name} is given twice, and no row has two of it.")
     rule = conditions.get("keep_actor") == TASK_AWARE
     if rule:
         del conditions["keep_actor"]
@@ -57,6 +61,10 @@ def _as_written(name: str, value: str) -> str:
         return str(frames(name, value))
     if name == "method":
         return ALIASES.get(value.lower(), value.lower())
+    if name in ("keep_actor", "keep_critic") and value.lower() in (*TRUE, *FALSE):
+        return "" if value.lower() in (NONE, "") else str(value.lower() in TRUE).lower()
+    if name in ("seed", "episodes") and value.isdecimal():
+        return str(int(value))
     return value.lower() if name in ("domain", "task", "keep_actor", "keep_critic", "planner") else value
 
 

@@ -39,6 +39,7 @@ class Evaluation:
     :param planner: that acted, ``none`` for the actor alone
     :param seconds: that it took
     :param seed: of the first episode
+    :param deterministic: whether the agent took its best actions; else it explored
     """
 
     returns: list[float]
@@ -46,6 +47,7 @@ class Evaluation:
     planner: str
     seconds: float
     seed: int
+    deterministic: bool = True
 
     @property
     def mean(self) -> float:
@@ -93,7 +95,17 @@ def run_evaluation(
             count = min(env.num_envs, episodes - len(played))
             played += _first_episodes(actor, env, count, seed + len(played), deterministic)
     returns, lengths = ([episode[part] for episode in played] for part in (0, 1))
-    return Evaluation(returns, [int(length) for length in lengths], name, time.perf_counter() - began, seed)
+    return Evaluation(returns, [int(length) for length in lengths], name, time.perf_counter() - began, seed, deterministic)
+
+
+def expected(
+    model: PolicyPredictor, episodes: int = EPISODES, seed: int = SEED, planner: str = AUTO, deterministic: bool = True
+) -> Evaluation:
+    """What :func:`run_evaluation` will be about, its returns NaN: for who asks whether its row will be welcome.
+
+    :param model: see :func:`run_evaluation`, as all others
+    """
+    return Evaluation([np.nan] * episodes, [0] * episodes, _acting(model, planner)[1], 0.0, seed, deterministic)
 
 
 def _first_episodes(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -107,25 +106,6 @@ def counted(number: int, one: str, many: str | None = None) -> str:
     :param many: and several, with an s if None
     """
     return f"{number} {one if number == 1 else many or one + 's'}"
-
-
-_ID = re.compile(r"(?P<family>urlb|rwrl)/(?P<domain>[a-z]+)-(?P<task>[a-z_]+)(?:-(?P<change>[a-z]+))?-v\d+")
-
-
-def columns_of_id(env_id: str) -> dict[str, str]:
-    """What the id of an environment says about a row.
-
-    :param env_id: such as ``urlb/walker-run-v0``, ``rwrl/walker-walk-easy-v0``, ``urlb/jaco-reach_top_left-sparse-v0``
-    :return: ``domain`` and ``task``, with ``perturbation`` (a level) or ``variant`` where there is one; of another id
-        its name without the version as the task of the domain ``gymnasium``
-    """
-    found = _ID.fullmatch(env_id)
-    if found is None:
-        return {"domain": "gymnasium", "task": re.sub(r"-v\d+$", "", env_id)}
-    columns = {"domain": found["domain"], "task": found["task"]}
-    if found["change"]:
-        columns["variant" if found["change"] in VARIANTS else "perturbation"] = found["change"]
-    return columns
 
 
 def _registered() -> Iterable[str]:

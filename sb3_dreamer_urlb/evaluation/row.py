@@ -30,6 +30,10 @@ WRITTEN = "written"
 NONE = "none"
 #: column of the arguments that make another task of an id; rows of the task as it is registered have none
 CHANGED = "environment"
+#: column of the task that an agent has learnt, where it was evaluated in another one
+LEARNT = "learnt_task"
+#: column of how an agent acted, where that was otherwise than in the paper
+ACTING = "acting"
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,11 @@ class Row:
         measured = {*RESULT, "seconds", *DESCRIBING}
         own = {name: text for name, text in texts(self).items() if name not in measured and text != ""}
         return tuple(sorted((name, text) for name, text in own.items() if name not in FLAGS or text != "false"))
+
+    @property
+    def is_of_the_benchmark(self) -> bool:
+        """Whether an agent's best actions were scored in the task that it learnt, and that task is as it is registered."""
+        return not any(self[column] for column in (CHANGED, LEARNT, ACTING))
 
     def setting(self, *varied: str) -> tuple[tuple[str, str], ...]:
         """The key of what is compared: whoever pairs rows or averages them asks for this, so that nothing is forgotten.

@@ -15,12 +15,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_dreamer_urlb.evaluation.names import UnknownName, counted
-from sb3_dreamer_urlb.evaluation.row import CHANGED, DESCRIBING, NONE, REQUIRED, RESULT, WRITTEN, Row, texts
+from sb3_dreamer_urlb.evaluation.row import ACTING, CHANGED, DESCRIBING, LEARNT, NONE, REQUIRED, RESULT, WRITTEN, Row, texts
 from sb3_dreamer_urlb.evaluation.row_parsing import frames, parse
 
 __all__ = [
+    "ACTING",
     "CHANGED",
     "DESCRIBING",
+    "LEARNT",
     "NONE",
     "REQUIRED",
     "RESULT",

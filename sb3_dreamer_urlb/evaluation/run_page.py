@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dreamer_urlb.evaluation.names import TASKS
-from sb3_dreamer_urlb.evaluation.rows import CHANGED
 from sb3_dreamer_urlb.evaluation.run_facts import AGENT, RunFacts, thinned
 from sb3_dreamer_urlb.evaluation.run_logs import Series
 from sb3_dreamer_urlb.evaluation.scores import ORACLE, normalized_score, published_returns
@@ -96,7 +95,7 @@ def _summary(facts: RunFacts) -> list[tuple[str, str]]:
 
 def _evaluation(row: Any) -> dict[str, str]:
     task = f"{row.domain}-{row.task}"
-    known = task in TASKS and not row[CHANGED]
+    known = task in TASKS and row.is_of_the_benchmark
     return {
         "run": f"{row.method}, {row.seed}",
         "task": task,

@@ -17,14 +17,15 @@ TEMPORARY = ".tmp"
 def written_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Write a file that replaces ``path`` only when the block ends well.
 
-    Whatever happens before, a full disk or kill -9 included, leaves the old file as it was.
+    Whatever happens before, a full disk or kill -9 included, leaves the old file as it was. A link stays one, and what it
+    leads to is replaced.
 
     :param path: missing folders are made
     :return: binary file to write to
     :raises NotADirectoryError: if a file is where a folder is needed, naming it
-    :raises OSError: naming ``path``
+    :raises OSError: naming ``path``; for a device or a pipe, too, which nothing may replace
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
     check_folder("the folder of a file", path.parent)
     # The process's number keeps two writers apart; a leftover of a killed process of the same number is overwritten.
     temporary = path.parent / f".{path.name}.{os.getpid()}{TEMPORARY}"
@@ -32,6 +33,8 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             raise IsADirectoryError(21, "Is a folder")
+        if path.exists() and not path.is_file():
+            raise OSError(22, "Is a device or a pipe, and no file that could be replaced")
         with open(temporary, "wb") as file:
             yield file
             file.flush()
@@ -57,8 +60,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def path_to_write(path: str | os.PathLike[str], suffix: str) -> Path:
-    """As Stable-Baselines3 names files: ``suffix`` is added where there is none."""
+    """As Stable-Baselines3 names files: ``suffix`` is added where there is none.
+
+    :raises IsADirectoryError: for the current folder, or the one around it
+    """
     path = Path(path)
+    if path.name in ("", ".."):
+        raise IsADirectoryError(f"{os.fspath(path)!r} is a folder: expected the path of a file, model.{suffix} say.")
     return path if path.suffix else Path(f"{path}.{suffix}")
 
 

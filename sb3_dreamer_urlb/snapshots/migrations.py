@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 #: of the files written now; goes up with every change that older code could not read
-VERSION = 4
+VERSION = 5
 
 
 def _from_1(kind: str, data: dict[str, Any]) -> dict[str, Any]:
@@ -31,7 +31,12 @@ def _from_3(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     return {**data, "kept": None} if kind == "model" else data
 
 
-MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2, 3: _from_3}
+def _from_4(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Version 5 says which task an agent has learnt; of older ones nobody knows."""
+    return {**data, "learnt_task": None} if kind == "model" else data
+
+
+MIGRATIONS: dict[int, Callable[[str, dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2, 3: _from_3, 4: _from_4}
 
 
 def migrate(kind: str, data: dict[str, Any], version: int) -> dict[str, Any]:

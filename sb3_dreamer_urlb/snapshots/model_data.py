@@ -29,7 +29,7 @@ COUNTERS = (
     "phase_timesteps", "phase_updates", "phase_frames", "pretrained_frames", "action_repeat", "env_faults", "skipped_updates",
 )  # fmt: skip
 FIELDS = {
-    "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "counters",
+    "policy", "arguments", "observation_space", "action_space", "n_envs", "phase", "domain", "learnt_task", "counters",
     "progress_remaining", "random", "episodes", "run", "kept",
 }  # fmt: skip
 #: what a fine-tuning may begin with, beside the world model
@@ -75,6 +75,7 @@ def describe(model: SavedAlgorithm, run: dict[str, Any] | None) -> dict[str, Any
         "n_envs": model.n_envs,
         "phase": model.phase,
         "domain": values.encode(model.domain),
+        "learnt_task": model.learnt_task,
         "counters": {name.lstrip("_"): values.encode(getattr(model, name)) for name in COUNTERS},
         "progress_remaining": float(model._current_progress_remaining),
         "random": capture(model),
@@ -258,8 +259,9 @@ def restore_fields(model: SavedAlgorithm, data: dict[str, Any]) -> None:
         setattr(model, name, value)
     if not isinstance(data["phase"], str) or data["phase"] not in phases.PHASES:
         raise ValueError(f"its phase is {str(data['phase'])[:80]!r}; known are {sorted(phases.PHASES)}")
-    if not (data["domain"] is None or isinstance(data["domain"], str)):
-        raise ValueError("its domain is no text")
+    for name in ("domain", "learnt_task"):
+        if not (data[name] is None or isinstance(data[name], str)):
+            raise ValueError(f"its {name} is no text")
     kept = data["kept"]
     known = isinstance(kept, dict) and set(kept) == KEPT and all(type(one) is bool for one in kept.values())
     if not (kept is None or known):
@@ -270,6 +272,7 @@ def restore_fields(model: SavedAlgorithm, data: dict[str, Any]) -> None:
     if not is_finite_number(data["progress_remaining"]):
         raise ValueError("its progress_remaining is no number")
     model.phase, model.domain, model.n_envs = data["phase"], data["domain"], data["n_envs"]
+    model.learnt_task = data["learnt_task"]
     model._current_progress_remaining = float(data["progress_remaining"])
     episodes = data["episodes"]
     if not all(set(info) == {"r", "l", "t"} and all(is_finite_number(value) for value in info.values()) for info in episodes):

@@ -58,6 +58,8 @@ class SavedAlgorithm(OffPolicyAlgorithm):
     phase: str
     #: of the environment's task, None where it does not tell
     domain: str | None
+    #: ``<domain>-<task>`` whose rewards it has learnt from last; None before, and of older files
+    learnt_task: str | None
     #: the set of hyperparameters that filled in what the caller left out
     preset: str
     #: of ``KEPT``: whether the fine-tuning began with the pre-trained one; None where nobody knows

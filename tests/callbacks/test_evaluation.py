@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from told import told_meanwhile
 
 from sb3_dreamer_urlb import DreamerV2, DrQv2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
+from sb3_dreamer_urlb.evaluation.arms import standard
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 
 WALKER = {"domain": "walker", "task": "run", "action_repeat": 2}
@@ -216,12 +218,18 @@ def test_the_command_takes_the_folder_of_a_run_of_the_zoo(tiny_model: Any, tmp_p
         (["--set", "keep_actor=perhaps", "--rows", "rows.csv"], "expected true, false or none, got 'perhaps'"),
         (["--planner", "on"], "the model has none"),
         (["--env-kwargs", "length"], "--env-kwargs: expected NAME=VALUE"),
+        (["--env-kwargs", "length=3", "length=4"], "--env-kwargs: length is given twice, as '3' and as '4'"),
+        (["--env-kwargs", "length=3", "size=1.5"], "cannot be made with --env-kwargs {'length': 3, 'size': 1.5}"),
+        (["--env-kwargs", "max_episode_steps=1.5"], "cannot be made with --env-kwargs {'max_episode_steps': 1.5}"),
+        (["--rows", "pipe"], "pipe is no file that rows can be kept in"),
+        (["--set", "keep_actor=true", "--rows", "rows.csv"], "--set keep_actor: the agent was not fine-tuned"),
     ],
 )
 def test_the_command_says_what_is_wrong(
     arguments: list[str], message: str, tiny_model: Any, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
     tiny_model(CounterEnv(20, **WALKER)).save(tmp_path / "agent")
     assert (
         main(["evaluate", "agent.zip", "--env", "Counter-v0", "--device", "cpu", "--env-kwargs", "length=3", *arguments]) == 2
@@ -239,3 +247,81 @@ def test_rows_that_cannot_be_written_are_told_before_the_first_step(tiny_model, 
     with pytest.raises(IsADirectoryError, match="is a folder: give a CSV file"):
         model.learn(5, callback=EvaluationCallback(CounterEnv(20, **WALKER), rows=tmp_path))
     assert model.num_timesteps == 0
+
+
+# -- what the benchmark's tables are not about -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def evaluate(tiny_model: Any, tmp_path: Path, capsys: Any) -> Any:
+    """Evaluate a model fine-tuned on walker run, with further options: status, output, rows."""
+    model = tiny_model(CounterEnv(5, **WALKER), seed=0)
+    model.learn(10).save(tmp_path / "agent")
+
+    def command(*arguments: str) -> Any:
+        rows = ["--rows", str(tmp_path / "rows.csv")] if "--rows" not in arguments else []
+        own = ["--env", "Counter-v0", "--device", "cpu", "--episodes", "2"]
+        status = main(["evaluate", str(tmp_path / "agent.zip"), *own, *rows, *arguments])
+        said = capsys.readouterr()
+        there = (tmp_path / "rows.csv").exists()
+        return status, said.out + said.err, read_rows(tmp_path / "rows.csv").rows if there else []
+
+    return command
+
+
+def test_an_agent_that_draws_its_actions_has_a_row_of_its_own(evaluate: Any) -> None:
+    status, _, [explored] = evaluate("--stochastic")
+    assert status == 0 and explored["acting"] == "stochastic" and not explored.is_of_the_benchmark
+    status, _, [_, acted] = evaluate()
+    assert status == 0 and acted["acting"] == "" and acted.is_of_the_benchmark
+    assert standard(acted) and not standard(explored)
+
+
+def test_an_agent_of_another_task_has_a_row_that_says_so(evaluate: Any) -> None:
+    status, said, [row] = evaluate("--env-kwargs", "task=walk")
+    assert status == 0 and "The agent has learnt walker-run, and plays walker-walk" in said and "Dreamer@2M" not in said
+    assert (row.task, row["learnt_task"]) == ("walk", "walker-run") and not standard(row)
+    status, said, [_, row] = evaluate()
+    assert status == 0 and "has learnt" not in said and row["learnt_task"] == "" and standard(row)
+
+
+def test_what_was_learnt_is_the_task_of_the_fine_tuning(tiny_model: Any, tmp_path: Path) -> None:
+    def env(task: str) -> CounterEnv:
+        return CounterEnv(5, **{**WALKER, "task": task})
+
+    model = tiny_model(env("stand"), intrinsic_reward="lbs").learn(10)
+    assert model.learnt_task is None
+    model.fine_tune(env("run"))
+    assert model.learnt_task is None
+    model.learn(10).save(tmp_path / "model")
+    assert model.learnt_task == "walker-run"
+    loaded = DreamerV2.load(tmp_path / "model", env=env("walk"))
+    assert loaded.learnt_task == "walker-run"
+    assert loaded.learn(10).learnt_task == "walker-walk"
+
+
+@pytest.mark.parametrize("arguments", [("--episodes", "3"), ("--seed", "7")])
+def test_a_row_that_will_be_refused_is_told_before_the_first_episode(
+    evaluate: Any, arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert evaluate()[0] == 0
+    monkeypatch.setattr(DreamerV2, "predict", None)
+    status, said, rows = evaluate(*arguments)
+    assert status == 2 and "holds another result of the same run" in said and len(rows) == 1
+
+
+def test_a_result_that_is_refused_ends_nothing_else(tiny_model: Any, tmp_path: Path, capsys: Any) -> None:
+    model = tiny_model(CounterEnv(20, **WALKER), planner="dyna_mpc", seed=0)
+    model.save(tmp_path / "agent")
+    command = ["evaluate", str(tmp_path / "agent.zip"), "--env", "Counter-v0", "--episodes", "1", "--device", "cpu"]
+    command += ["--rows", str(tmp_path / "rows.csv"), "--npz", str(tmp_path)]
+    assert main([*command, "--planner", "on"]) == 0
+    text = (tmp_path / "rows.csv").read_text()
+    [row] = read_rows(tmp_path / "rows.csv").rows
+    (tmp_path / "rows.csv").write_text(text.replace(f",{row.return_mean},", f",{row.return_mean + 1},"))
+    (tmp_path / "evaluations.npz").unlink()
+    assert main([*command, "--planner", "both"]) == 2
+    said = capsys.readouterr()
+    assert "holds another result of the same run" in said.err and "actor alone" in said.out
+    assert [row.planner for row in read_rows(tmp_path / "rows.csv").rows] == ["dyna_mpc", "none"]
+    assert (tmp_path / "evaluations.npz").exists()

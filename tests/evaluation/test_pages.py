@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -14,13 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_envs import CounterEnv
+from snapshot_files import change_data
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback, RunCheckpointCallback
 from sb3_dreamer_urlb.__main__ import main
-from sb3_dreamer_urlb.cli.compare import compare_runs
+from sb3_dreamer_urlb.cli.compare import _groups, compare_runs
 from sb3_dreamer_urlb.evaluation.append import append_rows
 from sb3_dreamer_urlb.evaluation.gifs import encode_gif
 from sb3_dreamer_urlb.evaluation.run_facts import read_run, thinned
@@ -169,8 +171,46 @@ def test_runs_side_by_side(run: Path, tmp_path: Path, capsys: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    ("folders", "labels"),
+    [
+        (["lbs/seed0", "icm/seed0"], ["lbs/seed0", "icm/seed0"]),
+        (["lbs/seed0", "icm/seed1"], ["seed0", "seed1"]),
+        (["seed0=lbs/seed1", "icm/seed0"], ["seed0", "icm/seed0"]),
+        (["a/b/run", "c/b/run", "run=lbs/seed0"], ["a/b/run", "c/b/run", "run"]),
+        (["lr=0.1,x/run"], ["run"]),
+        (["two=lbs/seed0,lbs/seed1", "two=icm/seed0"], ["two"]),
+    ],
+)
+def test_folders_are_groups_of_their_own(
+    folders: list[str], labels: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("lbs/seed0", "icm/seed0", "icm/seed1", "a/b/run", "c/b/run", "lr=0.1,x/run"):
+        (tmp_path / folder).mkdir(parents=True)
+    groups = _groups(folders)
+    assert list(groups) == labels
+    assert sum(map(len, groups.values())) == sum(1 + text.count(",") * ("=" in text[:5]) for text in folders) - (
+        1 if folders == ["lr=0.1,x/run"] else 0
+    )
+
+
+def test_who_averages_what_is_no_seed_of_one_setting_is_told(run: Path, tmp_path: Path, capsys: Any) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    assert main(["compare", f"both={run},{other}", "--out", str(tmp_path / "c.html")]) == 0
+    assert "These are averaged: both: seed 0 more than once" in capsys.readouterr().err
+    change_data(other / "snapshot.zip", other / "snapshot.zip", lambda data: data["arguments"].update(batch_size=77, seed=1))
+    assert main(["compare", f"both={run},{other}", "--out", str(tmp_path / "c.html")]) == 0
+    assert re.search(r"These are averaged: both: batch_size=\d+ / 77\n", capsys.readouterr().err)
+    assert main(["compare", str(run), str(other), "--out", str(tmp_path / "c.html")]) == 0
+    assert "averaged" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("command", "message"),
     [
+        (["compare", "a,b", "--out", "page.html"], "several runs are a group, which needs a label"),
+        (["compare", "here", "there/../here", "--out", "page.html"], "there/../here: given more than once"),
         (["report", "nowhere"], "nowhere is no folder of a run"),
         (["report", "."], "holds neither a snapshot nor logs"),
         (["compare", "nowhere", "--out", "page.html"], "nowhere is no folder of a run"),

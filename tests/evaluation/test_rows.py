@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sb3_dreamer_urlb.envs.naming import columns_of_id
 from sb3_dreamer_urlb.evaluation import names, rows
 from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row, append_rows
 from sb3_dreamer_urlb.evaluation.rows import REQUIRED, Row, read_rows
@@ -296,4 +297,15 @@ def test_what_cannot_be_read_is_not_written(row: Row, message: str, tmp_path: Pa
     ],
 )
 def test_what_an_id_says(env_id: str, columns: dict[str, str]) -> None:
-    assert names.columns_of_id(env_id) == columns
+    assert columns_of_id(env_id) == columns
+
+
+def test_rows_behind_a_link_are_one_file(tmp_path: Path) -> None:
+    real, link = tmp_path / "shared" / "rows.csv", tmp_path / "rows.csv"
+    real.parent.mkdir()
+    link.symlink_to(real)
+    append_row(link, ROW)
+    append_row(real, replace(ROW, seed=ROW.seed + 1, further={"arm": "wider"}))  # a further column writes the file anew
+    append_row(link, replace(ROW, seed=ROW.seed + 2, further={"arm": "b", "machine": "c"}))
+    assert link.is_symlink() and len(read_rows(real).rows) == 3
+    assert [path.name for path in tmp_path.glob(".*lock")] == []

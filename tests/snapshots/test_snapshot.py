@@ -8,6 +8,7 @@ import json
 import os
 import pickle
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -607,6 +608,16 @@ def test_a_file_of_version_3_is_brought_up_to_date(saved, tmp_path):
     assert same(loaded, saved[0]) and loaded.kept is None
 
 
+def test_a_file_of_version_4_is_brought_up_to_date(saved, tmp_path):
+    """It did not say which task its agent had learnt."""
+    old = json.loads(members(saved[1])["data"])
+    assert load(with_version(saved[1], tmp_path / "new.zip", VERSION, {**old, "learnt_task": "walker-run"})).learnt_task
+    refused(with_version(saved[1], tmp_path / "wrong.zip", VERSION, {**old, "learnt_task": 3}), "learnt_task is no text")
+    del old["learnt_task"]
+    loaded = load(with_version(saved[1], tmp_path / "old.zip", 4, old))
+    assert same(loaded, saved[0]) and loaded.learnt_task is None
+
+
 @pytest.mark.parametrize("version", [VERSION + 1, 0, -1, "2", True, 2.0, None])
 def test_versions_that_nobody_reads(saved, tmp_path, version):
     refused(with_version(saved[1], tmp_path / "m.zip", version), "version")
@@ -813,6 +824,33 @@ while True:
         loaded = load(path)
         assert loaded.num_timesteps > last
         assert loaded.policy.state_dict().keys() == saved[0].policy.state_dict().keys()
+
+
+def test_a_link_stays_one_and_its_file_is_written(tmp_path):
+    (tmp_path / "there").mkdir()
+    for number, target in enumerate((tmp_path / "there" / "model.zip", tmp_path / "missing.zip")):
+        link = tmp_path / f"link_{number}.zip"
+        link.symlink_to(target)
+        for content in (b"one", b"two"):
+            with written_atomically(link) as file:
+                file.write(content)
+            assert link.is_symlink() and target.read_bytes() == content
+    assert sorted(path.name for path in tmp_path.rglob("*.zip")) == ["link_0.zip", "link_1.zip", "missing.zip", "model.zip"]
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="no file that could be replaced"), written_atomically(tmp_path / "pipe"):
+        raise AssertionError("written")
+    assert (tmp_path / "pipe").is_fifo() and [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+@pytest.mark.parametrize("folder", [".", "..", "here/.."])
+def test_the_current_folder_is_no_file(tiny_model, folder):
+    model = tiny_model()
+    for save in (model.save, model.save_replay_buffer):
+        with pytest.raises(IsADirectoryError, match=f"{re.escape(repr(folder))} is a folder"):
+            save(folder)
 
 
 def test_an_error_in_the_middle_of_a_save_leaves_the_old_file(tmp_path):
