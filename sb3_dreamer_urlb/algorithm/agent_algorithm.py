@@ -141,6 +141,7 @@ class AgentAlgorithm(PhasedAlgorithm):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """See the policy's :meth:`~sb3_dreamer_urlb.algorithm.policy.AgentPolicy.predict`; acts as the run has come to."""
+        self.take_over_changes()
         self._prepare_policy()
         return self.policy.predict(observation, state, episode_start, deterministic)
 
@@ -185,6 +186,7 @@ class AgentAlgorithm(PhasedAlgorithm):
         :param batch_size: B
         :raises NumericalFaultError: if losses or gradients stay non-finite
         """
+        self.take_over_changes()
         if not self.replay_buffer.can_sample():
             return
         if self.learner.updates == 0:

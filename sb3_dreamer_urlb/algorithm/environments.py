@@ -17,6 +17,7 @@ from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.naming import task_of
 from sb3_dreamer_urlb.envs.normalized import watch_ends
 from sb3_dreamer_urlb.envs.touches import last_touches
+from sb3_dreamer_urlb.phases import PHASES
 
 
 class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
@@ -74,6 +75,8 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     def _go_on_normalized(self, known: Mapping[str, th.Tensor]) -> None:
         if max(self.phase_timesteps, self.num_timesteps) > 0:
+            if not PHASES[self.phase].explores:
+                normalized.warn_of_rewards(known, self._vec_normalize_env)
             normalized.go_on(known, self._vec_normalize_env)
 
     def _read_env(self) -> None:

@@ -82,6 +82,26 @@ def go_on(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
         )
 
 
+def warn_of_rewards(known: Mapping[str, th.Tensor], after: VecNormalize | None) -> None:
+    """Warn where a critic would go on with rewards of another scale.
+
+    :param known: as :func:`go_on`
+    :param after: likewise
+    """
+    before = normalization.stored_settings(known)
+    if after is None and before.get("norm_reward"):
+        texts: tuple[str, str] | None = ("norm_reward=1", "none")
+    elif after is None or not (after.norm_reward or before.get("norm_reward")):
+        texts = None
+    else:
+        texts = normalization.differing(known, after, normalization.OF_REWARDS)
+    if texts is not None:
+        warnings.warn(
+            f"The model has learnt from rewards through VecNormalize({texts[0]}), this environment has "
+            f"{'none' if after is None else f'VecNormalize({texts[1]})'}: what its critic knows is of another scale."
+        )
+
+
 def _has_seen_nothing(normalizer: VecNormalize) -> bool:
     """Or a reset at most."""
     seen = [part.count for name, part in normalization.statistics(normalizer).items() if name != normalization.RETURN]

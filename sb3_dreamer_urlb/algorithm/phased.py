@@ -187,6 +187,7 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
         keep_actor, keep_critic, keep_reward = plain((keep_actor, keep_critic, keep_reward))
         checks.check_kept(keep_actor, keep_critic, keep_reward)
         checks.check_pretrains(self)
+        self.take_over_changes()
         if env is not None:
             env = self.prepare_fine_tuning_env(env)
         if keep_reward:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
@@ -116,6 +117,14 @@ class SavingAlgorithm(RunningAlgorithm):
         model.run_folder = folder_of_it
         return model
 
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """Weights and the optimisers' moments as they are now: learning on does not change what was got.
+
+        :return: as Stable-Baselines3's, for :meth:`set_parameters` of this model or another one
+        """
+        self.take_over_changes()
+        return copy.deepcopy(super().get_parameters())
+
     def set_parameters(
         self, load_path_or_dict: Target | dict[str, Any], exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
@@ -127,7 +136,8 @@ class SavingAlgorithm(RunningAlgorithm):
         :raises SnapshotError: naming the file and why it is refused; the model stays as it is
         """
         if isinstance(load_path_or_dict, dict):
-            super().set_parameters(load_path_or_dict, exact_match, device)
+            # torch's optimisers keep the tensors that they are handed: two models would share their moments.
+            super().set_parameters(copy.deepcopy(load_path_or_dict), exact_match, device)
         else:
             model_snapshot.set_parameters(self, load_path_or_dict, exact_match)
 

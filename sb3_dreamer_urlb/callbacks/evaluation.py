@@ -33,12 +33,15 @@ from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.signatures import WithKnownKeywords
 from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
+from sb3_dreamer_urlb.unknown_names import UnknownNameError
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.dreamer_v2 import DreamerV2
 
 #: two rows an evaluation: with the planner and without
 BOTH = "both"
+#: arguments of ``EvalCallback`` that would do nothing here
+INSTEAD = {"eval_freq": "every_frames=..., which counts frames of the phase", "render": "VideoCallback films agents"}
 
 
 class EvaluationCallback(WithKnownKeywords, EvalCallback):
@@ -60,7 +63,7 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
     :param keep_critic: likewise
     :param columns: further columns of the rows, such as ``{"arm": "no bonus"}``
     :param seed: of the first episode
-    :param kwargs: of ``EvalCallback``
+    :param kwargs: of ``EvalCallback``, but for ``eval_freq`` and ``render``
     :raises ValueError: for numbers that are not positive, and, when ``learn`` begins, for an environment that the model
         trains in or whose spaces are not the model's, rows of a model without a seed, or ``"on"`` without a planner
     """
@@ -81,6 +84,8 @@ class EvaluationCallback(WithKnownKeywords, EvalCallback):
         seed: int = SEED,
         **kwargs: Any,
     ):
+        for name in kwargs.keys() & INSTEAD.keys():
+            raise UnknownNameError(f"EvaluationCallback takes no {name}: {INSTEAD[name]}.")
         for name, value in (("every_frames", every_frames), ("n_eval_episodes", n_eval_episodes)):
             check_integer(name, value, 1)
         if planner not in (*PLANNERS, BOTH):

@@ -257,6 +257,8 @@ class DreamerPolicy(AgentPolicy[ActingState]):
                 model = planned(self.agent, skill)
                 chosen = self.planner.plan(model, state.latent, plan, generator, explore=not deterministic)
                 action, plan = self.planner.returned("plan", chosen, state.action.shape, plan.shape)
+                # The replay is to hold what the environment gets, whatever somebody's own planner proposes.
+                action = self.actions.executable(action)
         else:
             policy = self.agent.actor(state.latent.feature, skill if self.agent.skills is not None else None)
             action = policy.mode if deterministic else policy.sample(generator)

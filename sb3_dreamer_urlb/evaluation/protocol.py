@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import numpy as np
 from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dreamer_urlb.number_checks import plain
+from sb3_dreamer_urlb.snapshots.normalization import of_observations
 
 
 class RandomPolicy:
@@ -39,7 +41,7 @@ class RandomPolicy:
 class PlayedEpisode:
     """One episode as it was played.
 
-    :param observations: as the environment gave them, (steps + 1, …), by name for Dicts
+    :param observations: as the model saw them, (steps + 1, …), by name for Dicts
     :param actions: as the environment received them, float (steps, A)
     :param total_reward: undiscounted return
     :param frames: large pictures, uint8, empty unless asked for
@@ -58,13 +60,20 @@ def play_episode(
 ) -> PlayedEpisode:
     """Play one episode, with the model's memory threaded through.
 
-    :param model: anything with SB3's ``predict``
+    :param model: anything with SB3's ``predict``; one that learnt behind ``VecNormalize`` sees what that makes of observations
     :param env: one environment, not vectorised
     :param seed: of the episode
     :param deterministic: handed to ``predict``
     :param render: also keep ``env.render()`` after each step
+    :raises ValueError: for a vectorised environment, and a model whose ``VecNormalize`` nobody knows
     """
-    observation, _ = env.reset(seed=plain(seed))
+    if isinstance(env, VecEnv):
+        raise ValueError(
+            f"play_episode() and evaluate() take one environment, got the vectorised {type(env).__name__}: evaluate_policy of "
+            "Stable-Baselines3 plays in these."
+        )
+    shown = _as_the_model_sees(model)
+    observation = shown(env.reset(seed=plain(seed))[0])
     observations, actions, frames, rewards = [observation], [], [], []
     state: Any = None
     done = False
@@ -72,7 +81,8 @@ def play_episode(
     while not done:
         action, state = model.predict(observation, state, start, deterministic)
         start = np.zeros(1, bool)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        given, reward, terminated, truncated, _ = env.step(action)
+        observation = shown(given)
         done = terminated or truncated
         rewards.append(float(reward))
         observations.append(observation)
@@ -80,6 +90,20 @@ def play_episode(
         if render:
             frames.append(np.asarray(env.render()))
     return PlayedEpisode(stacked(observations), np.stack(actions), sum(rewards), frames, np.array(rewards))
+
+
+def _as_the_model_sees(model: Any) -> Callable[[Any], Any]:
+    """From an environment's observation to what a model learnt from."""
+    get = getattr(model, "get_vec_normalize_env", None)
+    normalizer: VecNormalize | None = get() if callable(get) else None
+    if normalizer is not None:
+        return normalizer.normalize_obs
+    if getattr(model, "env", None) is None and of_observations(getattr(model, "loaded_statistics", {})):
+        raise ValueError(
+            "The model learnt from observations behind VecNormalize, and was loaded without an environment that has one: "
+            "load(path, env=VecNormalize(...)), which takes the statistics over."
+        )
+    return lambda observation: observation
 
 
 def stacked(observations: Sequence[Any]) -> np.ndarray | dict[str, np.ndarray]:

@@ -10,6 +10,9 @@ from torch import nn
 
 from sb3_dreamer_urlb.signatures import named_arguments
 
+#: of rewards; returns are computed in the first
+FLOATS = (th.float32, th.bfloat16, th.float16)
+
 
 class ExplorationMethod(nn.Module):
     """Base of :class:`~sb3_dreamer_urlb.IntrinsicReward`, which reads a world model, and of
@@ -44,7 +47,7 @@ def check_learnt(method: nn.Module, learnt: Any) -> None:
     if learnt is None:
         return
     good = isinstance(learnt, tuple) and len(learnt) == 2 and isinstance(learnt[0], th.Tensor) and isinstance(learnt[1], dict)
-    if not good or learnt[0].shape != () or not all(isinstance(value, th.Tensor) for value in learnt[1].values()):
+    if not good or not all(isinstance(value, th.Tensor) and value.shape == () for value in (learnt[0], *learnt[1].values())):
         raise ValueError(
             f"{type(method).__qualname__}.loss must return None, or a scalar tensor and a dictionary of scalar tensors "
             f"(the metrics), got {_kind_of(learnt)}."
@@ -61,9 +64,9 @@ def check_reward(method: nn.Module, name: str, reward: Any, shape: Sequence[int]
     :param of: that shape in words
     :raises ValueError: for another shape, or what is no tensor of floats
     """
-    if not isinstance(reward, th.Tensor) or not reward.is_floating_point() or tuple(reward.shape) != tuple(shape):
+    if not isinstance(reward, th.Tensor) or reward.dtype not in FLOATS or tuple(reward.shape) != tuple(shape):
         raise ValueError(
-            f"{type(method).__qualname__}.{name} must return a float tensor of the shape {of} = {tuple(shape)}, "
+            f"{type(method).__qualname__}.{name} must return a float32 tensor of the shape {of} = {tuple(shape)}, "
             f"got {_kind_of(reward)}."
         )
 

@@ -22,8 +22,10 @@ def register_intrinsic_reward(name: str, method: type[ExplorationMethod]) -> Non
 
     :param name: what users write
     :param method: subclass of :class:`IntrinsicReward`, or of ``TransitionReward``
-    :raises ValueError: if another class has that name already, or ``method`` is no such subclass
+    :raises ValueError: if another class has that name already, the name is no text, or ``method`` no such subclass
     """
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"The name of an intrinsic reward must be a text, got {name!r}.")
     if not (isinstance(method, type) and issubclass(method, ExplorationMethod)):
         raise ValueError(f"The intrinsic reward {name!r} must be a subclass of IntrinsicReward, got {method!r}.")
     if _REGISTRY.get(name, method) is not method:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import torch as th
 
-from sb3_dreamer_urlb.number_checks import check_integer, is_finite_number
+from sb3_dreamer_urlb.number_checks import check_integer, check_switch, is_finite_number
 from sb3_dreamer_urlb.types import LatentState
 
 #: of the Gaussian over actions that a plan begins with
@@ -69,6 +69,7 @@ class PlannerConfig:
             value = getattr(self, name)
             if not is_finite_number(value):
                 raise ValueError(f"planner {name} must be a finite number, got {value!r}.")
+        check_switch("planner use_value", self.use_value)
         if not 0 <= self.mixture <= 1:
             raise ValueError(f"planner mixture must lie in [0, 1], got {self.mixture!r}.")
         if not 0 <= self.momentum < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -85,6 +86,9 @@ def make_planner(
         return copy.deepcopy(planner)
     if not (planner is None or isinstance(planner, str) or (isinstance(planner, type) and issubclass(planner, Planner))):
         raise ValueError(f"planner must be a name, a subclass or an instance of Planner, or None, got {planner!r}.")
+    if isinstance(planner, type) and inspect.isabstract(planner):
+        lacking = ", ".join(sorted(planner.__abstractmethods__))
+        raise ValueError(f"planner must be a class that plans, {planner.__qualname__} lacks {lacking}.")
     if isinstance(planner, str) and planner not in _KINDS:
         meant = did_you_mean([planner], _KINDS)
         raise ValueError(f"Unknown planner {planner!r}; known are {sorted(_KINDS)} and None for the actor.{meant}")

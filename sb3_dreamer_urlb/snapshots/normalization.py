@@ -24,6 +24,8 @@ SETTINGS = f"{PREFIX}settings"
 SETTING_NAMES = (*NUMBERS, "norm_reward")
 #: those that change what an agent sees
 OF_OBSERVATIONS = ("clip_obs", "epsilon")
+#: those that change what it is paid
+OF_REWARDS = ("norm_reward", "clip_reward", "gamma")
 
 
 def statistics(normalizer: VecNormalize) -> dict[str, RunningMeanStd]:

@@ -34,6 +34,10 @@ class Actions(ABC):
         """From the space's actions, (n, …), to the agent's, float32 (n, A)."""
 
     @abstractmethod
+    def executable(self, action: th.Tensor) -> th.Tensor:
+        """The agent's action, (n, A), that an environment will be given for any numbers."""
+
+    @abstractmethod
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
         """Uniformly random actions of the agent, float (n, A)."""
 
@@ -74,6 +78,9 @@ class BoxActions(Actions):
         scaled: np.ndarray = 2.0 * (np.subtract(action, space.low, dtype=self.range.dtype) / self.range) - 1.0
         return scaled.reshape(-1, self.size).astype(np.float32)
 
+    def executable(self, action: th.Tensor) -> th.Tensor:
+        return action.clamp(-1, 1)
+
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
         return 2 * th.rand((n, self.size), generator=generator, device=device) - 1
 
@@ -97,6 +104,10 @@ class ClassActions(Actions):
     def from_env(self, action: np.ndarray) -> np.ndarray:
         chosen = th.as_tensor(np.asarray(action) - self.space.start).reshape(-1, len(self.classes))
         return one_hot_numbers(chosen, self.classes).numpy()
+
+    def executable(self, action: th.Tensor) -> th.Tensor:
+        chosen = th.stack([part.argmax(-1) for part in action.split(self.classes, -1)], -1)
+        return one_hot_numbers(chosen, self.classes).to(action.dtype)
 
     def random(self, n: int, generator: th.Generator | None, device: th.device) -> th.Tensor:
         return distributions.one_hot_choices(th.ones(n, self.size, device=device), self.classes, generator)

@@ -104,6 +104,12 @@ def test_bad_input(kwargs: dict[str, Any], message: str) -> None:
         EvaluationCallback(CounterEnv(), **kwargs)
 
 
+@pytest.mark.parametrize(("name", "instead"), [("eval_freq", "every_frames=..."), ("render", "VideoCallback")])
+def test_what_it_does_otherwise_than_its_base_is_said(name: str, instead: str) -> None:
+    with pytest.raises(TypeError, match=rf"EvaluationCallback takes no {name}: {instead}"):
+        EvaluationCallback(CounterEnv(), **{name: 500})
+
+
 def test_what_cannot_work_is_said_before_learning(tiny_model: Any, tmp_path: Path) -> None:
     model = tiny_model()
     with pytest.raises(ValueError, match="the one that is trained in"):

@@ -99,10 +99,16 @@ def test_a_planners_arguments_wait_for_it(tiny_model, tmp_path, how):
     assert model.policy.planner.config.n_samples == 9
 
 
-@pytest.mark.parametrize("then", ["learn", "save"])
+@pytest.mark.parametrize("then", ["learn", "save", "predict", "get_parameters", "train"])
 def test_what_is_changed_within_a_dictionary_is_assigned(tiny_model, tmp_path, then):
     model = tiny_model(planner="dyna_mpc", replay_buffer_kwargs={"sampling": "rows"})
-    act = {"learn": lambda: model.learn(4), "save": lambda: model.save(tmp_path / "m")}[then]
+    act = {
+        "learn": lambda: model.learn(4),
+        "save": lambda: model.save(tmp_path / "m"),
+        "predict": lambda: model.predict(np.zeros((16, 16, 3), np.uint8)),
+        "get_parameters": model.get_parameters,
+        "train": lambda: model.train(1, 1),
+    }[then]
     model.planner_kwargs["iterations"] = 7
     act()
     assert model.policy.planner.config.iterations == model.planner_kwargs["iterations"] == 7

@@ -458,7 +458,7 @@ def test_the_critic_trains_an_encoder_that_is_left_to_it_in_the_same_way(weights
     ],
 )
 def test_a_reward_of_another_shape_is_refused(reward, got):
-    with pytest.raises(ValueError, match=rf"Own.reward must return a float tensor of the shape \(B,\) = \(4,\).*{got}"):
+    with pytest.raises(ValueError, match=rf"Own.reward must return a float32 tensor of the shape \(B,\) = \(4,\).*{got}"):
         tiny(intrinsic_reward=Own(reward=reward)).learn(24)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,7 +21,7 @@ from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.evaluation.agent_rows import env_columns, row_of
 from sb3_dreamer_urlb.evaluation.append import append_row
 from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
-from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate
+from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.rows import read_rows
 
 
@@ -207,3 +208,21 @@ def test_an_environment_without_an_id_is_called_after_its_class(kind: Any, wrapp
 def test_random_actions_for_comparison() -> None:
     env = CounterEnv(20)
     assert evaluate(RandomPolicy(env.action_space), env, 1) == [pytest.approx(sum((0.0, 1.0, 0.5)[i % 3] for i in range(20)))]
+
+
+def test_an_agent_that_learnt_behind_vec_normalize_is_shown_what_it_knows(tmp_path: Path) -> None:
+    def normalized() -> VecNormalize:
+        return VecNormalize(make_vec_env("Pendulum-v1", 1), norm_reward=False)
+
+    model = DreamerV2("MlpPolicy", normalized(), preset="tiny", seed=0, device="cpu").learn(40)
+    env = gymnasium.make("Pendulum-v1")
+    expected = run_evaluation(model, normalized(), 2).returns
+    # The random draws of a batch are others than those of one environment, in what is drawn anew in each episode.
+    assert evaluate(model, env, 2) == pytest.approx(expected, rel=1e-4)
+    seen = play_episode(model, env, seed=3).observations
+    assert isinstance(seen, np.ndarray) and not (np.abs(seen[:, :2]) <= 1).all()
+    with pytest.raises(ValueError, match="take one environment, got the vectorised VecNormalize"):
+        evaluate(model, normalized(), 1)  # type: ignore[arg-type]
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="loaded without an environment that has one"):
+        evaluate(DreamerV2.load(tmp_path / "model"), env, 1)

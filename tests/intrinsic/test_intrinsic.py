@@ -398,8 +398,36 @@ class Misshapen(IntrinsicReward):
 @pytest.mark.parametrize(("part", "expected"), [("reward", r"\(H \+ 1, N\)"), ("replay_reward", r"\(B, T\)")])
 def test_a_reward_of_another_shape_is_refused(tiny_model, part, expected, shape):
     model = tiny_model(intrinsic_reward=Misshapen(part, shape))
-    with pytest.raises(ValueError, match=rf"Misshapen.{part} must return a float tensor of the shape {expected} = .*got"):
+    with pytest.raises(ValueError, match=rf"Misshapen.{part} must return a float32 tensor of the shape {expected} = .*got"):
         model.learn(60)
+
+
+class Wide(IntrinsicReward):
+    def reward(self, imagination, reward_head):
+        return super().reward(imagination, reward_head).double()
+
+
+class Metrics(IntrinsicReward):
+    def reward(self, imagination, reward_head):
+        return imagination.action.new_zeros(imagination.action.shape[:2])
+
+    def loss(self, posterior, batch):
+        return posterior.feature.sum() * 0, {"surprise": posterior.feature.sum(-1)}
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [(Wide, r"float32 tensor .* got torch.float64"), (Metrics, "a dictionary of scalar tensors .* got")],
+)
+def test_what_a_method_returns_is_of_the_right_kind(tiny_model, method, message):
+    with pytest.raises(ValueError, match=message):
+        tiny_model(intrinsic_reward=method).learn(60)
+
+
+@pytest.mark.parametrize("name", [5, "", None])
+def test_a_name_is_a_text(name):
+    with pytest.raises(ValueError, match="name of an intrinsic reward must be a text"):
+        register_intrinsic_reward(name, Wide)
 
 
 @pytest.mark.parametrize("kind", ["class", "instance", "name"])

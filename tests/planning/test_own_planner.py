@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
 
@@ -210,6 +211,38 @@ def test_it_sees_the_agent_and_its_memory_is_its_plan(tiny_model):
     model = tiny_model(planner=Still, learning_starts=0, planner_delay=0)
     action, _ = model.predict(np.zeros((1, 16, 16, 3), np.uint8))
     assert np.allclose(action, 0.5)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-2, 1, (2,), np.float32), spaces.MultiDiscrete([2, 3])], ids=["numbers", "choices"]
+)
+def test_the_replay_holds_what_the_environment_got(space):
+    class Far(Planner):
+        plans_choices = True
+
+        def plan(self, model, state, previous_mean, generator, explore):
+            action = th.full_like(previous_mean[:, 0], -5.0)
+            action[:, -1] = 5.0
+            return action, previous_mean
+
+    env = CounterEnv(6, action_space=space)
+    model = DreamerV2("CnnPolicy", env, preset="tiny", planner=Far, learning_starts=1, planner_delay=0, device="cpu").learn(13)
+    action, state = model.predict(env.reset()[0])
+    expected, stored = ([-2, 1], [-1, 1]) if isinstance(space, spaces.Box) else ([0, 2], [1, 0, 0, 0, 1])
+    assert action.tolist() == expected and state[2].tolist() == [stored]
+    assert all(np.allclose(received, expected) for received in env.received[1])
+    assert (model.replay_buffer.episodes[1].columns["action"][1:7] == np.float32(stored)).all()
+
+
+@pytest.mark.parametrize("value", ["False", 1, None])
+def test_the_switch_of_a_planner_is_one(tiny_model, value):
+    with pytest.raises(ValueError, match="planner use_value must be True or False"):
+        tiny_model(planner="dyna_mpc", planner_kwargs={"use_value": value})
+
+
+def test_a_class_that_plans_nothing_is_named(tiny_model):
+    with pytest.raises(ValueError, match="planner must be a class that plans, Planner lacks plan"):
+        tiny_model(planner=Planner)
 
 
 @pytest.mark.parametrize(

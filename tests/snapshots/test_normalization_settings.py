@@ -45,7 +45,25 @@ def test_what_goes_on_behind_other_settings_is_told_so(tmp_path, name):
         wrong = [text for text in said if "other numbers for the same state" in text]
         # A reward is no observation.
         assert len(wrong) == (bool(settings) and name in normalization.OF_OBSERVATIONS)
-        assert all(f"VecNormalize({name}={UNUSUAL[name]:g})" in text for text in wrong)
+        paid = [text for text in said if "of another scale" in text]
+        assert len(paid) == (bool(settings) and name in normalization.OF_REWARDS)
+        assert all(f"VecNormalize({name}={UNUSUAL[name]:g})" in text for text in [*wrong, *paid])
+
+
+def test_an_agent_that_explores_is_paid_by_nobody(tmp_path):
+    model = DreamerV2("MlpPolicy", normalized(), preset="tiny", intrinsic_reward="lbs", seed=0, device="cpu")
+    model.learn(24).save(tmp_path / "model.zip")
+    with told_meanwhile() as said:
+        loaded = DreamerV2.load(tmp_path / "model.zip", env=normalized(norm_reward=False), device="cpu")
+        loaded.fine_tune(normalized(gamma=0.5))
+    assert not any("scale" in text for text in said)
+
+
+def test_settings_of_rewards_that_nobody_normalises_are_no_matter(tmp_path):
+    learnt(normalized(norm_reward=False)).save(tmp_path / "model.zip")
+    with told_meanwhile() as said:
+        DreamerV2.load(tmp_path / "model.zip", env=normalized(norm_reward=False, gamma=0.5, clip_reward=1.0), device="cpu")
+    assert not any("scale" in text for text in said)
 
 
 @pytest.mark.parametrize("name", normalization.SETTING_NAMES)

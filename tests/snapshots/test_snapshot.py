@@ -691,6 +691,27 @@ def test_bare_pickles_are_refused(tmp_path, saved, maker):
 # -- set_parameters --------------------------------------------------------------------------------------------------------
 
 
+def test_parameters_that_were_handed_over_are_the_receivers_own(tiny_model, weights):
+    def moments(model):
+        return [float(state["step"]) for adam in model.adams().values() for state in adam.state.values()]
+
+    giver = tiny_model(seed=0).learn(40)
+    given = giver.get_parameters()
+    before = weights(giver.policy), moments(giver)
+    receivers = [tiny_model(seed=seed) for seed in (1, 2)]
+    for receiver in receivers:
+        receiver.set_parameters(given)
+        assert (weights(receiver.policy), moments(receiver)) == before
+    receivers[0].learn(40)
+    for other in (giver, receivers[1]):
+        assert (weights(other.policy), moments(other)) == before
+    # What was got stays as it was, so that it can be put back.
+    giver.learn(40)
+    assert (weights(giver.policy), moments(giver)) != before
+    giver.set_parameters(given)
+    assert (weights(giver.policy), moments(giver)) == before
+
+
 def test_set_parameters(saved, tiny_model):
     model, path = saved
     other = tiny_model(CounterEnv(8), intrinsic_reward="lbs", seed=5)
