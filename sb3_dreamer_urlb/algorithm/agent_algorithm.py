@@ -52,6 +52,10 @@ class AgentAlgorithm(PhasedAlgorithm):
             advice.warn_of_preset(self.preset, self.presets_made_for, self.policy.observations.has_images)
 
     def _build(self) -> None:
+        with self._building():
+            self._build_parts()
+
+    def _build_parts(self) -> None:
         if getattr(self, "replay_buffer", None) is None:
             self.replay_buffer = self._new_replay_buffer()
         self._skipped_before = self.skipped_updates

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 
 from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.number_checks import plain
+from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.snapshots.saved_algorithm import ATTRIBUTES, SavedAlgorithm
 
 #: an argument that files do not hold
 DEVICE = "device"
+#: what a model makes itself
+PARTS = ("policy", "replay_buffer")
 
 
 class AssignableArguments(SavedAlgorithm):
@@ -25,6 +30,8 @@ class AssignableArguments(SavedAlgorithm):
     #: arguments that decide what fine-tuning trains
     before_fine_tuning: ClassVar[frozenset[str]] = frozenset()
 
+    #: whether the model makes its own parts
+    _builds = False
     #: dictionaries among the arguments, as they are in force
     _dictionaries: dict[str, dict[str, Any]]
 
@@ -34,10 +41,40 @@ class AssignableArguments(SavedAlgorithm):
         :raises AttributeError: for an argument that networks or replay were built with
         :raises ValueError: for a value that does not fit; the old one stays
         """
+        if name in PARTS and "policy" in vars(self) and not self._builds:
+            self._check_part(name, value)
         self._assign(name, value)
         if self.assignable is not None and "policy" in vars(self) and (name == "policy" or name in self.assignable):
             found = {one: vars(self).get(one) for one in _watched_arguments(type(self))}
             super().__setattr__("_dictionaries", {one: plain(its) for one, its in found.items() if isinstance(its, dict)})
+
+    @contextmanager
+    def _building(self) -> Iterator[None]:
+        """Inside, the model makes its own parts."""
+        self._builds = True
+        try:
+            yield
+        finally:
+            self._builds = False
+
+    def _check_part(self, name: str, part: Any) -> None:
+        """
+        :raises AttributeError: for another policy, which nothing would train
+        :raises ValueError: for a replay of another form, or of another phase; None is none
+        """
+        if name == "policy" and part is not self.policy:
+            raise AttributeError(
+                "policy cannot be assigned: its networks are those that the learner trains. To take weights over: "
+                "model.policy.load_state_dict(other.state_dict()), model.set_parameters(...), or load a model."
+            )
+        if name == "replay_buffer" and isinstance(part, SequenceReplayBuffer):
+            expected = {one: getattr(self, one) for one in ("phase", "n_envs", "observation_space", "action_space")}
+            if (mine := vars(self).get(name)) is not None:
+                expected |= {one: getattr(mine, one) for one in ("batch_length", "skill_size", "tasks")}
+            wrong = [one for one, value in expected.items() if getattr(part, one) != value]
+            its, own = (", ".join(f"{one}={get(one)!r}" for one in wrong) for get in (part.__getattribute__, expected.get))
+            if wrong:
+                raise ValueError(f"replay_buffer must be one of this model in this phase, with {own}; this one has {its}.")
 
     def take_over_changes(self) -> None:
         """What was changed within a dictionary was assigned: nobody heard of it.

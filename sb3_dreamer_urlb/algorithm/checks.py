@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.normalized import hides_originals
 from sb3_dreamer_urlb.envs.registration import naming_near_ids
@@ -93,6 +93,8 @@ def given_env(env: Any, argument: str = "env") -> GymEnv:
     :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
     :raises ValueError: for environments that Gymnasium vectorised, and for what is no environment
     """
+    if isinstance(env, type):
+        raise ValueError(f"{argument} must be an environment, got the class {env.__qualname__}: {env.__qualname__}() is one.")
     if not isinstance(env, str) and not hasattr(env, "step"):
         raise ValueError(f"{argument} must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
     with naming_near_ids(str(env)):
@@ -103,12 +105,29 @@ def given_env(env: Any, argument: str = "env") -> GymEnv:
             "does: make it with make_vec_env, DummyVecEnv or SubprocVecEnv of stable_baselines3."
         )
     space = getattr(env, "observation_space", None)
+    check_equal_spaces(env, argument)
     parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
     for name, part in parts:
         if isinstance(part, spaces.Space) and not isinstance(part, spaces.Dict | spaces.Tuple) and part.shape is None:
             which = f"The observation {name!r} must be an array" if name else "Observations must be arrays"
             raise UnsupportedSpaceError(f"{which} of numbers, or several by name in a Dict, got {part}.")
     return env  # type: ignore[no-any-return]
+
+
+def check_equal_spaces(env: Any, argument: str) -> None:
+    """Whether the environments of a VecEnv are alike, as far as they are in this process; a VecEnv looks at the first only.
+
+    :param env: vectorised or not
+    :param argument: see :func:`given_env`
+    :raises ValueError: naming the first that has other spaces
+    """
+    inner = env.unwrapped if isinstance(env, VecEnv) else None
+    envs = inner.envs if isinstance(inner, DummyVecEnv) else []
+    for i, one in enumerate(envs):
+        for name in ("observation_space", "action_space"):
+            first, its = getattr(envs[0], name), getattr(one, name)
+            if its != first:
+                raise ValueError(f"{argument} must have one {name}: environment {i} has {its}, environment 0 {first}.")
 
 
 def check_keeps_fractions(env: VecEnv) -> None:
@@ -151,10 +170,16 @@ def check_schedule_of_updates(model: SavedAlgorithm) -> None:
     :param model: with its arguments, nothing built
     :raises ValueError: naming the argument, its value and what was expected
     """
-    frequency = model.train_freq[0] if isinstance(model.train_freq, tuple) else model.train_freq
-    if not is_integer(frequency) or frequency < 1:
+    frequency, *unit = model.train_freq or (None,) if isinstance(model.train_freq, tuple) else (model.train_freq, "step")
+    units = [getattr(one, "value", one) for one in unit]
+    if not is_integer(frequency) or frequency < 1 or units not in (["step"], ["episode"]):
         raise ValueError(
             f'train_freq must be a positive integer, or one with its unit, as (1, "episode"), got {model.train_freq!r}.'
+        )
+    if units == ["episode"] and model.n_envs > 1:
+        raise ValueError(
+            f"train_freq={(frequency, *units)!r}: {model.n_envs} environments end their episodes at different times; with "
+            "several, it counts steps."
         )
     if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
         raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")

@@ -71,12 +71,16 @@ class CollectingAlgorithm(SavingAlgorithm):
         """
         n = len(actions)
         if action_noise is not None:
+            # One for all environments, or one for each.
             noise = np.asarray(action_noise())
-            if noise.size not in (n, actions.size):
+            rows = n if isinstance(action_noise, VectorizedActionNoise) else 1
+            if noise.size not in (rows, rows * actions[0].size):
                 raise ValueError(
                     f"action_noise gives {noise.size} numbers, for {n} environment(s) with {actions[0].size} actions each."
                 )
-            actions = np.clip(actions + noise.reshape(n, -1), -1, 1)
+            if not np.isfinite(noise).all():
+                raise ValueError(f"action_noise gives {noise}; expected finite numbers.")
+            actions = np.clip(actions + noise.reshape(rows, -1), -1, 1)
         check_finite_action(actions, "The policy", self.num_timesteps)
         self.phase_timesteps += n
         self.phase_frames += n * self.action_repeat
@@ -126,6 +130,8 @@ class CollectingAlgorithm(SavingAlgorithm):
                 actions, buffer_actions = self._sample_action(learning_starts, action_noise, env.num_envs)
                 new_obs, rewards, dones, infos = env.step(actions)
                 rewards, dones = np.asarray(rewards), np.asarray(dones, bool)
+                with asking_to("step"):
+                    env_steps.check_form(new_obs, rewards, dones, env.num_envs)
                 self._touches = last_touches(env)
                 self.num_timesteps += env.num_envs
                 self._store_transition(replay_buffer, buffer_actions, new_obs, rewards, dones, infos)  # type: ignore[arg-type]

@@ -26,13 +26,14 @@ class LearningVecEnv(VecEnvWrapper):
     """Environments in whose last step of a rollout the learner works.
 
     :param venv: the environments
-    :param update: what to do in that step
+    :param update: what to do in that step; told the rollout's agent steps, and how many of them are still under way
     :param overlap: do it after the actions are sent and before results are waited for; otherwise before they are sent
     """
 
-    def __init__(self, venv: VecEnv, update: Callable[[], None], overlap: bool):
+    def __init__(self, venv: VecEnv, update: Callable[[int, int], None], overlap: bool):
         super().__init__(venv)
         self.update, self.overlap = update, overlap
+        self.steps = 0
         self.left: int | None = None
 
     def begin(self, steps: int | None) -> LearningVecEnv:
@@ -41,6 +42,7 @@ class LearningVecEnv(VecEnvWrapper):
         :param steps: it has; None where nobody knows, so that no update can come before its last step ends
         :return: self
         """
+        self.steps = (steps or 0) * self.num_envs
         self.left = steps
         return self
 
@@ -53,14 +55,14 @@ class LearningVecEnv(VecEnvWrapper):
         if self.left is not None:
             self.left -= 1
         if self.left == 0 and not self.overlap:
-            self.update()
+            self.update(self.steps, self.num_envs)
         self.venv.step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """:raises Exception: of the update, which comes first, or of the environments"""
         if self.left == 0 and self.overlap:
             try:
-                self.update()
+                self.update(self.steps, self.num_envs)
             except BaseException:
                 # Or the next question to a process would get the answer to this one.
                 with suppress(Exception):
@@ -87,15 +89,15 @@ def learn(
     :param update: the updates of one rollout; told its agent steps, and how many of them are still under way
     :param overlap: let the environments step meanwhile
     """
-    assert isinstance(model.train_freq, TrainFreq) and model.replay_buffer is not None
-    frequency, unit = model.train_freq
-    steps = frequency if unit == TrainFrequencyUnit.STEP else None
     env: LearningVecEnv | None = None
     while model.num_timesteps < total_timesteps:
-        assert model.env is not None
+        assert model.env is not None and model.replay_buffer is not None and isinstance(model.train_freq, TrainFreq)
+        # In each round: a callback may have assigned another one.
+        frequency, unit = model.train_freq
+        steps = frequency if unit == TrainFrequencyUnit.STEP else None
         if env is None or env.venv is not model.env:
             # At first, and when a callback brought other environments.
-            env = LearningVecEnv(model.env, lambda: update(frequency * model.n_envs, model.n_envs), overlap)
+            env = LearningVecEnv(model.env, update, overlap)
         rollout = model.collect_rollouts(
             env.begin(steps),
             callbacks,

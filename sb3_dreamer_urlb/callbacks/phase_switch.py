@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dreamer_urlb.algorithm import PhasedAlgorithm
 from sb3_dreamer_urlb.algorithm.checks import check_kept
+from sb3_dreamer_urlb.callbacks.best import forget_best
 from sb3_dreamer_urlb.callbacks.placing import BetweenRolloutsCallback
 from sb3_dreamer_urlb.number_checks import is_integer, plain
 from sb3_dreamer_urlb.phases import PRETRAINING
@@ -20,7 +21,8 @@ class PhaseSwitchCallback(WithKnownKeywords, BetweenRolloutsCallback):
 
     The switch happens at the end of the rollout in which the phase's frames are reached, unless ``learn`` ends with it:
     then the model stays pre-trained, and the next ``learn`` begins with the switch. It depends only on the model's own phase
-    and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless.
+    and frame counter, which snapshots carry: repeated ``learn`` calls and resets are harmless. Evaluations begin a new search
+    for the best model then, also those of Stable-Baselines3's ``EvalCallback``.
 
     :param pretrain_frames: length of the pre-training in environment frames (agent steps × action repeat)
     :param env: the fine-tuning environment or its id; None stays in the same one
@@ -100,6 +102,7 @@ class PhaseSwitchCallback(WithKnownKeywords, BetweenRolloutsCallback):
         before = model.get_env()
         model.fine_tune(self.env, self.keep_actor, self.keep_critic, self.keep_reward)
         model.restart_episodes()
+        forget_best(self.locals.get("callbacks"))
         if self.closes_pretraining and before is not None and before is not model.get_env():
             before.close()
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 #: what Python and numpy raise over answers of another form than was promised
-RAISED = (TypeError, ValueError, LookupError, AttributeError, AssertionError)
+RAISED = (TypeError, ValueError, LookupError, AttributeError, AssertionError, RuntimeError, EOFError, ConnectionError)
 NOTE = (
     "It was raised while the environments were asked to {what}. stable_baselines3.common.env_checker.check_env(env) tells "
     "whether an environment keeps to its spaces and to Gymnasium's interface."

@@ -19,6 +19,27 @@ def is_fault(info: dict[str, Any]) -> bool:
     return FAULT in info
 
 
+def check_form(observation: Any, reward: np.ndarray, dones: np.ndarray, n: int) -> None:
+    """Whether a vectorised environment, which others may have written, gives one row for each of its environments.
+
+    :param observation: (n, …), or such by name
+    :param reward: (n,)
+    :param dones: (n,)
+    :param n: number of environments
+    :raises ValueError: naming what has another form
+    """
+    parts = observation.items() if isinstance(observation, dict) else [("", observation)]
+    for name, part in parts:
+        if not isinstance(part, np.ndarray) or part.shape[:1] != (n,):
+            what = f"array of the shape {part.shape}" if isinstance(part, np.ndarray) else type(part).__name__
+            raise ValueError(
+                f"The vectorised environment must give arrays of {n} observations{f' {name!r}' if name else ''}, got {what}."
+            )
+    for what, values in (("rewards", reward), ("ends", dones)):
+        if values.shape != (n,):
+            raise ValueError(f"The vectorised environment must give {n} {what}, got an array of the shape {values.shape}.")
+
+
 def check_finite(observation: Any, reward: np.ndarray, when: str) -> None:
     """Refuse numbers that are none, where no guard caught them.
 

@@ -9,6 +9,7 @@ episodes and a cursor that tells which. Episodes that left since the last checkp
 from __future__ import annotations
 
 import fcntl
+import gc
 import json
 import os
 import shutil
@@ -96,11 +97,19 @@ class LmdbStore:
 
     def _take_lock(self) -> IO[str]:
         lock = open(self.path / "writer.lock", "a+")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            raise ReplayStoreError(f"{self.path} is in use by another run, or by another buffer of this one.") from None
+        for last in (False, True):
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if last:
+                    lock.close()
+                    raise ReplayStoreError(
+                        f"{self.path} is in use by another run, or by another buffer of this one: a model of this program "
+                        "that nobody needs gives it back when it is deleted (del model)."
+                    ) from None
+                # A model that nobody holds any more may still be there: it refers to itself.
+                gc.collect()
         return lock
 
     def _open(self) -> None:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-
 from sb3_dreamer_urlb.callbacks.snapshot import SNAPSHOT_FRAMES, SnapshotCallback
 
 
@@ -33,24 +30,3 @@ class RunSnapshotCallback(SnapshotCallback):
     def _init_callback(self) -> None:
         if self.save_path:
             super()._init_callback()
-
-
-class BestOfPhase(BaseCallback):
-    """Lets Stable-Baselines3's evaluation begin anew with each phase: an agent that explores is no best one of the task's.
-
-    :param evaluation: which stands behind this one
-    """
-
-    def __init__(self, evaluation: EvalCallback):
-        super().__init__()
-        self.evaluation = evaluation
-        self.phase = ""
-
-    def _init_callback(self) -> None:
-        self.phase = self.model.phase  # type: ignore[attr-defined] # it has phases
-
-    def _on_step(self) -> bool:
-        phase = self.model.phase  # type: ignore[attr-defined]
-        if phase != self.phase:
-            self.phase, self.evaluation.best_mean_reward = phase, -np.inf
-        return True

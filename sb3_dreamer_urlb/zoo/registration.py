@@ -32,7 +32,7 @@ from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 from sb3_dreamer_urlb.zoo import configs, env_arguments, hyperparameters, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
-from sb3_dreamer_urlb.zoo.callbacks import BestOfPhase, RunSnapshotCallback
+from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
 
 
 def register() -> None:
@@ -223,8 +223,6 @@ def _create_callbacks(original: Callable[..., Any], manager: Any) -> None:
         if isinstance(callback, VideoCallback) and callback.folder is None:
             callback.folder = Path(manager.save_path) / "videos"
     evaluation = next((callback for callback in manager.callbacks if isinstance(callback, EvalCallback)), None)
-    if evaluation is not None:
-        manager.callbacks.insert(manager.callbacks.index(evaluation), BestOfPhase(evaluation))
     kept = any(isinstance(callback, RunCheckpointCallback) for callback in manager.callbacks)
     if manager.optimize_hyperparameters or manager.checkpoint_options is False or kept:
         return

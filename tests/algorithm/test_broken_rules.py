@@ -5,10 +5,13 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+import torch as th
+from fake_envs import CounterEnv
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, DrQv2
 from sb3_dreamer_urlb.mistakes import tell
 
 BOX = spaces.Box(-1, 1, (3,), np.float32)
@@ -146,3 +149,59 @@ def test_other_errors_are_left_alone():
             model.learn(4, callback=fails)
         assert not hasattr(raised.value, "__notes__")
     assert model.learn(4).num_timesteps == 4
+
+
+# -- vectorised environments that others wrote -----------------------------------------------------------------------------
+
+FORMS = {
+    "rewards by rows": (
+        lambda seen, reward: (seen, reward[:, None]),
+        r"must give 2 rewards, got an array of the shape \(2, 1\)",
+    ),
+    "too few rows": (lambda seen, reward: (seen[:1], reward), r"arrays of 2 observations, got array of the shape \(1, 3\)"),
+    "tensors": (lambda seen, reward: (th.as_tensor(seen), reward), "arrays of 2 observations, got Tensor"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_rows_of_another_form_are_named(form):
+    change, message = FORMS[form]
+
+    class Others(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_wait(self):
+            seen, reward, dones, infos = self.venv.step_wait()
+            return (*change(seen, reward), dones, infos)
+
+    model = DreamerV2("MlpPolicy", Others(DummyVecEnv([Kept] * 2)), preset="tiny", device="cpu")
+    with pytest.raises(ValueError, match=message) as raised:
+        model.learn(8)
+    assert "asked to step" in raised.value.__notes__[0]
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space"])
+def test_environments_with_unequal_spaces_are_named(name):
+    class Other(Kept):
+        pass
+
+    setattr(Other, name, spaces.Box(-5, 5, (3,), np.float32))
+    with pytest.raises(ValueError, match=rf"env must have one {name}: environment 1 has Box\(-5.0, 5.0"):
+        DreamerV2("MlpPolicy", DummyVecEnv([Kept, Other]), preset="tiny")
+
+
+def test_a_class_is_no_environment():
+    with pytest.raises(ValueError, match=r"env must be an environment, got the class Kept: Kept\(\) is one"):
+        DreamerV2("MlpPolicy", Kept, preset="tiny")
+    model = DreamerV2("MlpPolicy", Kept(), preset="tiny")
+    with pytest.raises(ValueError, match="got the class Kept"):
+        model.set_env(Kept)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_noise_that_is_none_is_not_the_policys_fault(n_envs):
+    noise = NormalActionNoise(np.full(2, np.nan), np.zeros(2))
+    env = DummyVecEnv([lambda: CounterEnv(5, observation_space=BOX)] * n_envs)
+    with pytest.raises(ValueError, match=r"action_noise gives .*nan.*; expected finite numbers"):
+        DrQv2("MlpPolicy", env, preset="tiny", action_noise=noise).learn(20)

@@ -7,7 +7,14 @@ import pytest
 import torch as th
 from fake_envs import CounterEnv
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    ConvertCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from told import told_meanwhile
@@ -456,6 +463,30 @@ def test_a_snapshot_is_fine_tuned_by_the_papers_flow(tiny_model, tmp_path):
 def test_bad_frames_of_snapshots(frames, tmp_path):
     with pytest.raises(ValueError, match="sequence of positive integers"):
         SnapshotCallback(tmp_path, frames)
+
+
+# -- the best model --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("listed", [False, True], ids=["flat", "in lists"])
+def test_an_agent_that_explored_is_no_best_one_of_the_task(tiny_model, tmp_path, listed):
+    stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=3)
+    evaluation = EvalCallback(
+        vec_env(), callback_after_eval=stop, n_eval_episodes=1, eval_freq=10, best_model_save_path=str(tmp_path), warn=False,
+        verbose=0,
+    )  # fmt: skip
+
+    def exploring_pays(locals_, _):
+        if locals_["self"].num_timesteps == 30:
+            evaluation.best_mean_reward = stop.last_best_mean_reward = 1e9
+        return True
+
+    callbacks = [PhaseSwitchCallback(40), evaluation]
+    model = tiny_model(vec_env(), intrinsic_reward="lbs", learning_starts=0)
+    given = [CallbackList(callbacks[:1]), CallbackList([CallbackList(callbacks[1:])])] if listed else callbacks
+    model.learn(80, callback=[ConvertCallback(exploring_pays), *given])
+    assert model.num_timesteps == 80 and evaluation.best_mean_reward < 1e9
+    assert DreamerV2.load(tmp_path / "best_model.zip").phase == "finetuning"
 
 
 # -- where callbacks are given ---------------------------------------------------------------------------------------------

@@ -6,9 +6,12 @@ import copy
 
 import numpy as np
 import pytest
+from fake_envs import CounterEnv
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.algorithm.assignable_arguments import same
@@ -138,3 +141,80 @@ def test_bad_values_leave_the_old_ones(tiny_model, name, value):
     with pytest.raises(ValueError, match=name):
         setattr(model, name, value)
     assert getattr(model, name) == before and in_force(model) == force
+
+
+# -- within a learn --------------------------------------------------------------------------------------------------------
+
+
+class At(BaseCallback):
+    """Does something to the model after so many steps."""
+
+    def __init__(self, steps, then):
+        super().__init__()
+        self.steps, self.then = steps, then
+
+    def _on_step(self):
+        if self.num_timesteps == self.steps:
+            self.then(self.model)
+        return True
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+@pytest.mark.parametrize("unit", ["step", "episode"])
+@pytest.mark.parametrize("frequency", [2, 8])
+def test_updates_come_as_often_as_was_assigned(tiny_model, overlap, unit, frequency):
+    """Within a rollout of four steps of two environments, whose end comes first; each step that follows is learnt from."""
+    n_envs, gradient_steps = (2, -1) if unit == "step" else (1, 1)
+    env = DummyVecEnv([lambda: CounterEnv(8)] * n_envs)
+    model = tiny_model(env, learning_starts=0, gradient_steps=gradient_steps, train_freq=4, overlap=overlap)
+    model.learn(40 * n_envs)
+    before = model._n_updates
+    callback = At(42 * n_envs, lambda model: setattr(model, "train_freq", (frequency, unit)))
+    model.learn(64 * n_envs, callback=callback, reset_num_timesteps=False)
+    if unit == "step":
+        assert model._n_updates - before == model.num_timesteps - 40 * n_envs
+    else:
+        # A rollout of four steps, then some of two or eight episodes, until 104 steps are done.
+        assert model._n_updates - before == {2: 1 + 4, 8: 1 + 1}[frequency]
+
+
+@pytest.mark.parametrize("n_envs", [2, 3])
+def test_noise_that_was_assigned_is_of_the_action(tiny_model, n_envs):
+    class First(NormalActionNoise):
+        def __call__(self):
+            return np.array([0.5, 0.0], np.float32)
+
+    noise = First(np.zeros(2), np.zeros(2))
+    model = tiny_model(DummyVecEnv([lambda: CounterEnv(8)] * n_envs))
+    expected = [[0.5, 0.0]] * n_envs
+    assert model._as_executed(np.zeros((n_envs, 2)), noise).tolist() == expected
+    assert model._as_executed(np.zeros((n_envs, 2)), VectorizedActionNoise(noise, n_envs)).tolist() == expected
+    with pytest.raises(ValueError, match="action_noise gives 3 numbers"):
+        model._as_executed(np.zeros((n_envs, 2)), NormalActionNoise(np.zeros(3), np.zeros(3)))
+
+
+# -- the parts of a model --------------------------------------------------------------------------------------------------
+
+
+def test_a_policy_that_nothing_would_train_is_not_assigned(tiny_model):
+    model, other = tiny_model(), tiny_model(seed=3)
+    with pytest.raises(AttributeError, match=r"policy cannot be assigned.*load_state_dict"):
+        model.policy = other.policy
+    model.policy = model.policy
+    model.policy.load_state_dict(other.policy.state_dict())
+    before = model.policy.agent
+    model.learn(40)
+    assert model.learner.agent is model.policy.agent is before and model._n_updates > 0
+
+
+def test_a_replay_of_another_phase_or_form_is_not_assigned(tiny_model):
+    model = tiny_model(intrinsic_reward="lbs").learn(40)
+    replay = model.replay_buffer
+    model.fine_tune()
+    with pytest.raises(ValueError, match="with phase='finetuning'; this one has phase='pretraining'"):
+        model.replay_buffer = replay
+    with pytest.raises(ValueError, match="with batch_length=.*; this one has batch_length=5"):
+        model.replay_buffer = tiny_model(batch_length=5).replay_buffer
+    twin = tiny_model().learn(40)
+    model.replay_buffer = twin.replay_buffer
+    assert model.replay_buffer is twin.replay_buffer

@@ -176,7 +176,9 @@ def test_rates(refused, name, value):
     refused(f"{name} must be a non-negative number.*got {value!r}", **{name: value})
 
 
-@pytest.mark.parametrize("value", [0, -4, 2.5, (0, "step"), (-1, "episode"), [1, "episode"]])
+@pytest.mark.parametrize(
+    "value", [0, -4, 2.5, (0, "step"), (-1, "episode"), [1, "episode"], (4,), (), (4, "step", 1), (4, None)]
+)
 def test_train_freq(refused, value):
     refused(r'train_freq must be a positive integer, or one with its unit, as \(1, "episode"\), got', train_freq=value)
 

@@ -19,7 +19,6 @@ from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback,
 from sb3_dreamer_urlb.envs import EnvironmentFaultError, FaultGuard
 from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.runs.run_folder import SNAPSHOT
-from sb3_dreamer_urlb.zoo.callbacks import BestOfPhase
 
 # -- resume="auto" ---------------------------------------------------------------------------------------------------------
 
@@ -127,12 +126,10 @@ def test_evaluations_of_a_run_that_goes_on_are_those_of_a_whole_one(
         kwargs = {"n_eval_episodes": n_eval_episodes, "verbose": 0, "log_path": str(folder), "warn": False}
         if ours:
             evaluation = EvaluationCallback(vec_env(), every_frames=30, pretraining=True, **kwargs)
-            before = []
         else:
             evaluation = EvalCallback(vec_env(), eval_freq=30, **kwargs)
-            before = [BestOfPhase(evaluation)]
         keep = RunCheckpointCallback(folder / "run", 10, evaluation=evaluation, resume="auto")
-        return evaluation, [PhaseSwitchCallback(60), *before, evaluation, keep]
+        return evaluation, [PhaseSwitchCallback(60), evaluation, keep]
 
     def model():
         return tiny_model(vec_env(), intrinsic_reward="lbs")
