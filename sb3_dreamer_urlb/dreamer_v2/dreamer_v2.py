@@ -37,7 +37,7 @@ class DreamerV2(AgentAlgorithm):
     """DreamerV2 with unsupervised pre-training, task-aware fine-tuning and Dyna-MPC.
 
     "Mastering the Unsupervised Reinforcement Learning Benchmark from Pixels" (ICML 2023). With an ``intrinsic_reward``
-    the model starts in the *pre-training* phase: the environment's rewards are logged, and the actor seeks others. Without one it
+    the model starts in the *pre-training* phase: the environment's rewards are logged, the actor seeks others. Without one it
     learns the task at once. :meth:`fine_tune`, or a :class:`~sb3_dreamer_urlb.PhaseSwitchCallback`, moves on to
     fine-tuning. All defaults are the paper's.
 

@@ -118,6 +118,10 @@ class DreamerPolicy(AgentPolicy[ActingState]):
         for name, size in [*sizes.items(), *((f"net_arch[{i}]", width) for i, width in enumerate(net_arch))]:
             if not is_integer(size) or size < 1:
                 raise ValueError(f"policy_kwargs: {name} must be a positive integer, got {size!r}.")
+        if stoch_classes < 2:
+            raise ValueError(
+                f"policy_kwargs: stoch_classes must be at least 2, for one class says nothing, got {stoch_classes!r}."
+            )
         #: widths of the hidden layers; without any, every network that has nothing to convolve is linear
         self.net_arch = net_arch
         if planner is not None and planner.classes != self.actions.classes:

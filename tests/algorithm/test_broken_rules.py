@@ -203,5 +203,5 @@ def test_a_class_is_no_environment():
 def test_noise_that_is_none_is_not_the_policys_fault(n_envs):
     noise = NormalActionNoise(np.full(2, np.nan), np.zeros(2))
     env = DummyVecEnv([lambda: CounterEnv(5, observation_space=BOX)] * n_envs)
-    with pytest.raises(ValueError, match=r"action_noise gives .*nan.*; expected finite numbers"):
+    with pytest.raises(ValueError, match=r"(?s)action_noise gives .*nan.*; expected finite numbers"):
         DrQv2("MlpPolicy", env, preset="tiny", action_noise=noise).learn(20)

@@ -213,7 +213,7 @@ def test_a_replay_of_another_phase_or_form_is_not_assigned(tiny_model):
     model.fine_tune()
     with pytest.raises(ValueError, match="with phase='finetuning'; this one has phase='pretraining'"):
         model.replay_buffer = replay
-    with pytest.raises(ValueError, match="with batch_length=.*; this one has batch_length=5"):
+    with pytest.raises(ValueError, match=r"with batch_length=.*; this one has batch_length=5"):
         model.replay_buffer = tiny_model(batch_length=5).replay_buffer
     twin = tiny_model().learn(40)
     model.replay_buffer = twin.replay_buffer
