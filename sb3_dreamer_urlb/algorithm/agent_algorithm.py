@@ -32,6 +32,8 @@ class AgentAlgorithm(PhasedAlgorithm):
     """
 
     policy: AgentPolicy[Any]
+    #: name → the arguments that a preset changes
+    presets: ClassVar[Mapping[str, dict[str, Any]]] = MappingProxyType({})
     #: what its presets are made for, see :func:`~sb3_dreamer_urlb.algorithm.advice.warn_of_preset`
     presets_made_for: ClassVar[Mapping[str, Collection[str]]] = MappingProxyType({})
     #: how updates run, one of ``graphs.COMPILE``

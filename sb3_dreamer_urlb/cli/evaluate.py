@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 from sb3_dreamer_urlb.cli.agents import (
     add_evaluation_arguments,
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 HELP = "evaluate a saved agent: episodes with fixed seeds, a row of a CSV file, evaluations.npz"
 BOTH = "both"
+NPZ = "evaluations.npz"
 #: columns of a row that nobody may set, with the result itself
 MEASURED = frozenset(("seconds", "planner", "evaluation_seed", "returns", "versions", "written"))
 
@@ -37,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--planner", choices=choices, default="auto", help="who acts; both plays twice (default: %(default)s)")
     parser.add_argument("--stochastic", action="store_true", help="explore as in training")
     parser.add_argument("--rows", type=a_path, help="CSV file that a row is added to")
-    parser.add_argument("--npz", type=a_path, help="folder of evaluations.npz, as Stable-Baselines3's EvalCallback writes it")
+    parser.add_argument(
+        "--npz", type=a_path, help="folder of a new evaluations.npz, as EvalCallback's; of both, the planner's"
+    )
     parser.add_argument("--set", nargs="+", metavar="COLUMN=VALUE", help="columns of the row: arm=mine keep_actor=false")
     add_statistics_argument(parser)
     parser.add_argument("--device", default="auto", help="(default: %(default)s)")
@@ -55,6 +60,7 @@ def run(options: dict[str, Any]) -> int:
     from sb3_dreamer_urlb.evaluation.agent_rows import results_of, row_of
     from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row, check_can_append
     from sb3_dreamer_urlb.evaluation.episodes import expected, run_evaluation
+    from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
     if "set" in options and "rows" not in options:
         raise ValueError("--set is about the row: it needs --rows FILE.")
@@ -73,6 +79,8 @@ def run(options: dict[str, Any]) -> int:
         if "rows" in options:
             _check_fits(model, about)
             check_can_append(options["rows"], rows)
+        if "npz" in options:
+            _check_replaces_no_others(options["npz"] / NPZ, model.num_timesteps)
         _say_what_is_unusual(model, rows[0])
         for which in how:
             played.append(run_evaluation(model, env, *which))
@@ -88,7 +96,8 @@ def run(options: dict[str, Any]) -> int:
     finally:
         env.close()
     if "npz" in options:
-        np.savez(options["npz"] / "evaluations.npz", **results_of(played[:1], [model.num_timesteps]))  # type: ignore[arg-type]
+        with written_atomically(options["npz"] / NPZ) as file:
+            np.savez(file, **results_of(played[:1], [model.num_timesteps]))  # type: ignore[arg-type]
     if refused is not None:
         raise refused
     return 0
@@ -109,6 +118,22 @@ def _check_fits(model: Any, about: dict[str, Any]) -> None:
     kept = [name for name in ("keep_actor", "keep_critic") if about.get(name) is not None]
     if kept and not was_fine_tuned(model):
         raise ValueError(f"--set {kept[0]}: the agent was not fine-tuned from a pre-trained one, so that it kept nothing.")
+
+
+def _check_replaces_no_others(path: Path, steps: int) -> None:
+    """A run keeps all its evaluations in a file of that name."""
+    import numpy as np
+
+    if not path.exists():
+        return
+    try:
+        with np.load(path) as file:
+            there = file["timesteps"].tolist()
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        there = None
+    if there != [steps]:
+        what = "cannot be read" if there is None else f"holds evaluations after {', '.join(map(str, there[:5]))} steps"
+        raise ValueError(f"--npz: {path} {what}, this one is after {steps}: give another folder.")
 
 
 def _say_what_is_unusual(model: Any, row: Row) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_dreamer_urlb.command_parser import a_path, at_least
 from sb3_dreamer_urlb.folders import made_folder
+from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 if TYPE_CHECKING:
     from sb3_dreamer_urlb.evaluation.arms import Study
@@ -177,7 +178,8 @@ def _write(tables: list[Table], pictures: list[Picture], missing: list[str], out
     for picture in pictures:
         written.update(path.name for path in picture.write(out))
         captions.append(f"**{picture.name}**: {picture.caption}\n")
-    (out / "captions.md").write_text("\n".join(captions), encoding="utf-8")
+    with written_atomically(out / "captions.md") as file:
+        file.write("\n".join(captions).encode())
     print(f"In {out}: {', '.join([*(table.name for table in tables), *(picture.name for picture in pictures)])}.")
     if missing:
         print(f"No rows for: {', '.join(missing)}.")

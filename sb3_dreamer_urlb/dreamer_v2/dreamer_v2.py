@@ -20,7 +20,7 @@ from sb3_dreamer_urlb.algorithm.agent_algorithm import AgentAlgorithm
 from sb3_dreamer_urlb.behavior.actor_critic import AUTO, choose_gradient
 from sb3_dreamer_urlb.dreamer_v2 import arguments, kept_parts
 from sb3_dreamer_urlb.dreamer_v2.policies import ActingState, CnnPolicy, DreamerPolicy, MlpPolicy, MultiInputPolicy
-from sb3_dreamer_urlb.dreamer_v2.presets import MADE_FOR, get_preset, with_preset
+from sb3_dreamer_urlb.dreamer_v2.presets import MADE_FOR, PRESETS, get_preset, with_preset
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.intrinsic import IntrinsicReward, SkillReward, make_intrinsic_reward
 from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
@@ -128,6 +128,7 @@ class DreamerV2(AgentAlgorithm):
     of_the_networks = arguments.OF_THE_NETWORKS
     filled_in = arguments.FILLED_IN
     before_fine_tuning = arguments.BEFORE_FINE_TUNING
+    presets = PRESETS
     presets_made_for = MADE_FOR
     policy: DreamerPolicy
     learner: Learner

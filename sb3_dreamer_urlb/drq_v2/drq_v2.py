@@ -17,7 +17,7 @@ from sb3_dreamer_urlb.drq_v2 import arguments, kept_parts
 from sb3_dreamer_urlb.drq_v2.learner import DrQLearner, DrQLearnerConfig
 from sb3_dreamer_urlb.drq_v2.noise import NoiseStd, noise_at
 from sb3_dreamer_urlb.drq_v2.policies import CnnPolicy, DrQPolicy, MlpPolicy
-from sb3_dreamer_urlb.drq_v2.presets import MADE_FOR, with_preset
+from sb3_dreamer_urlb.drq_v2.presets import MADE_FOR, PRESETS, with_preset
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
 from sb3_dreamer_urlb.signatures import constructed
@@ -90,6 +90,7 @@ class DrQv2(AgentAlgorithm):
     of_the_networks = arguments.OF_THE_NETWORKS
     filled_in = arguments.FILLED_IN
     before_fine_tuning = arguments.BEFORE_FINE_TUNING
+    presets = PRESETS
     presets_made_for = MADE_FOR
     policy: DrQPolicy
     learner: DrQLearner

@@ -15,6 +15,7 @@ from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.naming import task_columns
 from sb3_dreamer_urlb.evaluation.episodes import Evaluation
 from sb3_dreamer_urlb.evaluation.rows import ACTING, CHANGED, LEARNT, REQUIRED, Row
+from sb3_dreamer_urlb.evaluation.settings import as_text, settings_of
 from sb3_dreamer_urlb.phases import PHASES
 from sb3_dreamer_urlb.snapshots import values
 
@@ -78,7 +79,8 @@ def was_fine_tuned(model: Any) -> bool:
 
 
 def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool | None = None) -> dict[str, Any]:
-    """What a model tells about itself: method, seed, frames, what it kept, preset, algorithm; ``known_reward`` if it was.
+    """What a model tells about itself: method, seed, frames, what it kept, preset, algorithm; ``known_reward`` if it was, and
+    ``settings`` where hyperparameters are otherwise than the preset's.
 
     :param model: any of Stable-Baselines3
     :param keep_actor: see :func:`row_of`
@@ -104,6 +106,7 @@ def agent_columns(model: Any, keep_actor: bool | None = None, keep_critic: bool 
         "keep_critic": (kept.get("critic") if keep_critic is None else keep_critic) if tuned else None,
         "preset": getattr(model, "preset", ""),
         "algorithm": algorithm,
+        **({"settings": text} if (text := as_text(settings_of(model))) else {}),
         **({"known_reward": "true"} if tuned and kept.get("reward") else {}),
     }
 

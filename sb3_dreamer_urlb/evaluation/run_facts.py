@@ -151,7 +151,8 @@ def read_run(folder: Path, rows: list[Path] | None = None) -> RunFacts:
         facts.rows += own
         facts.notes += read.report().splitlines()
     if facts.snapshot is None and not facts.series:
-        raise FileNotFoundError(f"{folder} holds neither a snapshot nor logs of a run.")
+        why = f": {' '.join(facts.notes)}" if facts.notes else "."
+        raise FileNotFoundError(f"{folder} holds neither a snapshot nor logs of a run that can be read{why}")
     return facts
 
 

@@ -48,6 +48,7 @@ def read_logs(folder: Path, switch: float | None, window: int) -> Logs:
     folders = _log_folders(folder, "events.out.tfevents.*")
     if not logs.series and folders:
         _read_events(logs, folders)
+    logs.series = {tag: _in_order(points) for tag, points in logs.series.items()}
     kept: dict[str, Callable[[], Series]] = {
         "rollout/ep_rew_mean": lambda: _returns(folder, switch, window),
         "eval/mean_reward": lambda: _evaluations(logs, folder / "evaluations.npz"),
@@ -58,6 +59,11 @@ def read_logs(folder: Path, switch: float | None, window: int) -> Logs:
     return logs
 
 
+def _in_order(points: Series) -> Series:
+    """By step, and each step once: what was logged last, for a run that went on has gone through some steps again."""
+    return sorted(dict(points).items())
+
+
 def _log_folders(folder: Path, name: str) -> list[Path]:
     """Folders of one run that hold a log: the run's own, or else the one below, or those that a logger numbers.
 
@@ -65,11 +71,17 @@ def _log_folders(folder: Path, name: str) -> list[Path]:
     """
     if any(folder.glob(name)):
         return [folder]
-    found = sorted({path.parent for path in folder.rglob(name)})
+    found = sorted({path.parent for path in folder.rglob(name)}, key=_by_number)
     runs = {path.parent / re.sub(r"_\d+$", "", path.name) for path in found}
     if len(runs) > 1:
         raise ValueError(f"{folder} holds several runs, not one: name one of {', '.join(map(str, found))}.")
     return found
+
+
+def _by_number(folder: Path) -> tuple[str, int]:
+    """A logger's tenth folder comes after its ninth."""
+    name, _, number = str(folder).rpartition("_")
+    return (name, int(number)) if number.isdecimal() else (str(folder), 0)
 
 
 def _read_events(logs: Logs, folders: list[Path]) -> None:
@@ -81,8 +93,6 @@ def _read_events(logs: Logs, folders: list[Path]) -> None:
         for tag in events.Tags()["scalars"]:
             points = [(float(event.step), float(event.value)) for event in events.Scalars(tag)]
             logs.series.setdefault(tag, []).extend(points)
-    for points in logs.series.values():
-        points.sort()
 
 
 def _read_progress(logs: Logs, path: Path, name: str) -> None:

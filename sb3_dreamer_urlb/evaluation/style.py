@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_dreamer_urlb.evaluation.aggregate import Estimate
+from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 from sb3_dreamer_urlb.version import how_to_install
 
 #: Okabe and Ito's colours, told apart by everybody, in the order of use
@@ -79,7 +80,8 @@ class Picture:
 
         paths = [folder / f"{self.name}.{suffix}" for suffix in ("pdf", "png")]
         for path in paths:
-            self.figure.savefig(path, dpi=DPI)
+            with written_atomically(path) as file:
+                self.figure.savefig(file, format=path.suffix[1:], dpi=DPI)
         plt.close(self.figure)
         return paths
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sb3_dreamer_urlb.evaluation.aggregate import Estimate
 from sb3_dreamer_urlb.evaluation.rows import line_of
+from sb3_dreamer_urlb.snapshots.atomic import written_atomically
 
 MISSING = "–"
 _LATEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "±": r"$\pm$", "–": "--", "→": r"$\to$", "≥": r"$\ge$"}
@@ -65,7 +66,8 @@ class Table:
         paths = []
         for suffix, content in (("md", self.markdown()), ("csv", self.csv()), ("tex", self.latex())):
             paths.append(folder / f"{self.name}.{suffix}")
-            paths[-1].write_text(content, encoding="utf-8")
+            with written_atomically(paths[-1]) as file:
+                file.write(content.encode())
         return paths
 
 

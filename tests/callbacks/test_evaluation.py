@@ -331,3 +331,14 @@ def test_a_result_that_is_refused_ends_nothing_else(tiny_model: Any, tmp_path: P
     assert "holds another result of the same run" in said.err and "actor alone" in said.out
     assert [row.planner for row in read_rows(tmp_path / "rows.csv").rows] == ["dyna_mpc", "none"]
     assert (tmp_path / "evaluations.npz").exists()
+
+
+def test_a_runs_own_evaluations_are_not_replaced(evaluate: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "npz"
+    assert evaluate("--npz", str(folder))[0] == 0
+    assert evaluate("--npz", str(folder))[0] == 0  # the same once more
+    for content in ({"timesteps": np.array([4, 10])}, {"steps": np.array([4])}):
+        np.savez(folder / "evaluations.npz", **content)
+        before = (folder / "evaluations.npz").read_bytes()
+        status, said, _ = evaluate("--npz", str(folder))
+        assert status == 2 and "give another folder" in said and (folder / "evaluations.npz").read_bytes() == before

@@ -17,12 +17,15 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, DrQv2
 from sb3_dreamer_urlb.evaluation.agent_rows import env_columns, row_of
 from sb3_dreamer_urlb.evaluation.append import append_row
+from sb3_dreamer_urlb.evaluation.arms import Study
+from sb3_dreamer_urlb.evaluation.curves import selected
 from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
 from sb3_dreamer_urlb.evaluation.protocol import RandomPolicy, evaluate, play_episode
 from sb3_dreamer_urlb.evaluation.rows import read_rows
+from sb3_dreamer_urlb.evaluation.settings import settings_of
 
 
 class SeedEnv(gymnasium.Env):
@@ -226,3 +229,36 @@ def test_an_agent_that_learnt_behind_vec_normalize_is_shown_what_it_knows(tmp_pa
     model.save(tmp_path / "model")
     with pytest.raises(ValueError, match="loaded without an environment that has one"):
         evaluate(DreamerV2.load(tmp_path / "model"), env, 1)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "preset"),
+    [(kind, preset) for kind in (DreamerV2, DrQv2) for preset in kind.presets if preset not in ("paper", "state")],
+)
+def test_a_preset_alone_has_no_settings(algorithm: Any, preset: str) -> None:
+    for kwargs in ({}, {"intrinsic_reward": "disagreement" if algorithm is DrQv2 else "lbs"}):
+        model = algorithm("MlpPolicy", "Pendulum-v1", preset=preset, seed=3, device="cpu", verbose=1, **kwargs)
+        assert settings_of(model) == {}
+
+
+def test_other_hyperparameters_are_another_run(tmp_path: Path) -> None:
+    other = {
+        "batch_size": 5,
+        "learning_rate": 0.1,
+        "policy_kwargs": {"net_arch": [4, 4]},
+        "replay_buffer_kwargs": {"sampling": "rows"},
+        "train_freq": (1, "episode"),
+    }
+    text = "batch_size:5;learning_rate:0.1;policy_kwargs.net_arch:4/4;replay_buffer_kwargs.sampling:rows;train_freq:1/episode"
+    env = make_vec_env("Pendulum-v1", 1)
+    for kwargs, expected in (({}, ""), (other, text)):
+        model = DreamerV2("MlpPolicy", "Pendulum-v1", preset="tiny", seed=0, device="cpu", **kwargs)
+        model.save(tmp_path / "model")
+        for one in (model, DreamerV2.load(tmp_path / "model", device="cpu")):
+            row = row_of(one, env, run_evaluation(one, env, 1))
+            assert row["settings"] == expected
+        append_row(tmp_path / "rows.csv", row)
+    rows = read_rows(tmp_path / "rows.csv", strict=False).rows
+    assert len(rows) == 2 and len(Study(rows).mixtures()) == 1 and "settings is" in Study(rows).mixtures()[0]
+    assert selected(rows, f"settings={text}").rows == (rows[1],)
+    assert settings_of(PPO("MlpPolicy", "Pendulum-v1")) == {}
