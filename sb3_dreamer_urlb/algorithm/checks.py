@@ -176,11 +176,6 @@ def check_schedule_of_updates(model: SavedAlgorithm) -> None:
         raise ValueError(
             f'train_freq must be a positive integer, or one with its unit, as (1, "episode"), got {model.train_freq!r}.'
         )
-    if units == ["episode"] and model.n_envs > 1:
-        raise ValueError(
-            f"train_freq={(frequency, *units)!r}: {model.n_envs} environments end their episodes at different times; with "
-            "several, it counts steps."
-        )
     if not is_integer(model.gradient_steps) or model.gradient_steps < -1:
         raise ValueError(f"gradient_steps must be -1 or a non-negative integer, got {model.gradient_steps!r}.")
 

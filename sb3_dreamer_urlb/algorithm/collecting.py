@@ -41,7 +41,7 @@ class CollectingAlgorithm(SavingAlgorithm):
     action_repeat: int
     #: faults that environments' guards reported so far
     env_faults: int
-    #: ``<domain>-<task>`` of the present environment
+    #: ``<domain>-<task>`` of the present environment, None where it does not tell
     _task: str | None = None
     #: see ``last_touches``; as of when the model itself last reset or stepped its environments
     _touches: tuple[int, ...] = ()
@@ -115,8 +115,7 @@ class CollectingAlgorithm(SavingAlgorithm):
             "You must use only one env when doing episodic training."
         )
         self.policy.set_training_mode(False)
-        if not phases.PHASES[self.phase].explores:
-            self.learnt_task = self._task
+        self._note_task()
         going_on_in = env.venv if isinstance(env, LearningVecEnv) else env
         num_collected_steps, num_collected_episodes = 0, 0
         continue_training = True
@@ -181,6 +180,20 @@ class CollectingAlgorithm(SavingAlgorithm):
         """Whether somebody else reset or stepped the environments since the model did, or they are others."""
         assert self.env is not None
         return last_touches(self.env) != self._touches
+
+    def _note_task(self) -> None:
+        """Remember whose rewards the agent learns from; nobody means to mix those of two tasks unawares.
+
+        :raises ValueError: where a run goes on in another task
+        """
+        if phases.PHASES[self.phase].explores or self._task is None:
+            return
+        if self.learnt_task not in (None, self._task):
+            said = f"has learnt {self.learnt_task} so far, and its environment is now of {self._task}"
+            if self.run_folder is not None and self.run_folder.resumed:
+                raise ValueError(f"The run in {self.run_folder.path} {said}: a run keeps its task. load() begins another one.")
+            warnings.warn(f"The model {said}: its critic and its replay know the other's rewards.")
+        self.learnt_task = self._task
 
     def _learns_of_ends(self) -> bool:
         """Whether the agent learns that a terminated episode gives no more rewards."""

@@ -77,6 +77,11 @@ class RunCheckpointCallback(WithKnownKeywords, BetweenRolloutsCallback, Resuming
                 f"{self.folder} holds another run. To go on with it: RunCheckpointCallback(..., resume='auto') with a new "
                 f"model, or {type(model).__name__}.resume({str(self.folder)!r}, env); for a new run choose another folder."
             )
+        if run.lost_its_checkpoint():
+            raise ValueError(
+                f"{self.folder} holds the replay of a run without its checkpoint: put {run.snapshot.name} back, or choose "
+                "another folder. A run that begins here would remove that replay."
+            )
         model.run_folder = self.run = run
         run.begun = True
         model.checkpoint = self._checkpoint

@@ -50,10 +50,11 @@ def task_columns(env: VecEnv) -> dict[str, str]:
     return columns
 
 
-def task_of(env: VecEnv) -> str:
-    """``<domain>-<task>``, whatever is changed about it.
+def task_of(env: VecEnv) -> str | None:
+    """``<domain>-<task>``, whatever is changed about it; None where nothing but the name of a class would tell.
 
     :param env: of which the first is asked
     """
     columns = task_columns(env)
-    return f"{columns['domain']}-{columns['task']}"
+    nameless = columns["domain"] == GYMNASIUM and env_attribute(env, "spec", None) is None
+    return None if nameless else f"{columns['domain']}-{columns['task']}"

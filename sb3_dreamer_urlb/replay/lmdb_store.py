@@ -272,7 +272,10 @@ class LmdbStore:
         :raises ReplayStoreError: if episodes that the checkpoint names are not there
         """
         if end > self.first + len(self.lengths) or end < 0:
-            raise ReplayStoreError(f"{self.path} lacks episodes that the checkpoint names.")
+            raise ReplayStoreError(
+                f"{self.path} lacks episodes that the checkpoint names. If the replay was moved: resume(folder, env, "
+                "replay_buffer_kwargs={'path': ...})."
+            )
         there = min(max(first, self._oldest), end)
         self.keep_from = there
         with self._removing():

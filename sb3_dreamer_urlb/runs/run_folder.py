@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +23,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dreamer_urlb.folders import made_folder
+from sb3_dreamer_urlb.number_checks import is_finite_number
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.runs import evaluation_history
 from sb3_dreamer_urlb.snapshots import model as model_snapshot
@@ -39,6 +41,8 @@ CHECKPOINT = "checkpoint"
 PRETRAINING_LOGS = "pretraining"
 SNAPSHOT, REPLAY, LOCK = "snapshot.zip", "replay", "lock"
 FIELDS = {"number", "segments", "open", "evicted", "finished_count", "longest", "evaluation"}
+#: of runs whose replay is a store on disk; of those whose checkpoints say when they were written
+SOME_HAVE = {"stored", "written"}
 
 
 @dataclass
@@ -82,6 +86,12 @@ class RunFolder:
         """Whether the checkpoint on disk is the one that this object wrote or read."""
         return self.identity == _identity(self.snapshot)
 
+    def lost_its_checkpoint(self) -> bool:
+        """Whether a run's replay lies here without its checkpoint: a file that was moved, half a copy. What a run leaves that
+        is killed while it writes its first one does not count."""
+        numbers = [file.name.partition(".")[0].partition("-")[0] for file in (self.path / REPLAY).glob("*.zip")]
+        return not self.snapshot.exists() and any(name.isdecimal() and int(name) > 1 for name in numbers)
+
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def save(self, model: SavedAlgorithm, evaluation: dict[str, Any] | None = None) -> None:
@@ -117,6 +127,7 @@ class RunFolder:
             "longest": buffer.longest,
             "evaluation": evaluation,
             **({} if stored is None else {"stored": stored}),
+            "written": time.time(),
         }
         model_snapshot.save(model, self.snapshot, run)
         self.number, self.segments, self._buffer = number, segments, weakref.ref(buffer)
@@ -164,7 +175,7 @@ class RunFolder:
         :raises SnapshotError: naming the file and why it is refused
         """
         with blaming(str(self.snapshot)):
-            if not isinstance(run, dict) or set(run) - {"stored"} != FIELDS:
+            if not isinstance(run, dict) or set(run) - SOME_HAVE != FIELDS:
                 raise ValueError("it was not saved in a run folder")
             if ("stored" in run) != (model.replay_buffer.path is not None):
                 raise ValueError("its replay is kept in another store")
@@ -245,6 +256,19 @@ def _plain_name(name: Any) -> str:
     if not isinstance(name, str) or Path(name).name != name or not name.endswith(".zip"):
         raise ValueError(f"it names the replay file {str(name)[:80]!r}")
     return name
+
+
+def written_at(folder: str | os.PathLike[str]) -> float:
+    """When the last checkpoint was written, in seconds since 1970: as it says itself, for copies have times of their own.
+
+    :param folder: of a run that has one
+    """
+    path = Path(folder) / SNAPSHOT
+    with suppress(SnapshotError), reading(path, model_snapshot.KIND) as archive:
+        said: Any = (archive.data.get("run") or {}).get("written")
+        if is_finite_number(said):
+            return float(said)
+    return path.stat().st_mtime
 
 
 def steps_done(folder: str | os.PathLike[str]) -> int:

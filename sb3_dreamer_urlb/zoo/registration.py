@@ -27,12 +27,13 @@ from sb3_dreamer_urlb.callbacks.videos import VideoCallback
 from sb3_dreamer_urlb.devices import known_device
 from sb3_dreamer_urlb.envs.supervisor import SupervisedVecEnv
 from sb3_dreamer_urlb.phases import PRETRAINING
-from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, steps_done
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.vec_normalize import beside, load_vec_normalize
 from sb3_dreamer_urlb.zoo import configs, env_arguments, hyperparameters, mistakes, pretraining, resuming, schedules
 from sb3_dreamer_urlb.zoo.algorithms import ALGORITHMS
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
+from sb3_dreamer_urlb.zoo.monitor_files import put_monitor_files_aside
 
 
 def register() -> None:
@@ -90,6 +91,8 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
             manager.config = configs.resolve(manager.config, manager.algo)
             configs.check(manager.config, manager.env_name.gym_id)
         hyperparams, config = original(manager)
+        if run is not None and resuming.has_checkpoint(run):
+            resuming.check_same(run, hyperparams, manager.custom_hyperparams)
     env_arguments.merge(manager, given, hyperparams, config)
     hyperparameters.check(hyperparams, manager.algo, named_parameters(ALGORITHMS[manager.algo].kind))
     if "policy" not in hyperparams:
@@ -112,7 +115,7 @@ def _read_hyperparameters(original: Callable[..., Any], manager: Any) -> tuple[d
     if run is None and resume is not None:
         run = _find_run(manager, config, hyperparams)
     if run is not None:
-        _go_on(manager, run)
+        _go_on(manager, run, _steps(manager, hyperparams))
     return hyperparams, config
 
 
@@ -141,8 +144,13 @@ def _default_config(algorithm: str, env_id: str) -> Path:
     return (knowing or there)[0]
 
 
+def _steps(manager: Any, hyperparams: dict[str, Any]) -> int:
+    """Agent steps of the whole run."""
+    return manager.n_timesteps if manager.n_timesteps > 0 else int(hyperparams["n_timesteps"])
+
+
 def _find_run(manager: Any, config: dict[str, Any], hyperparams: dict[str, Any]) -> Path | None:
-    steps = manager.n_timesteps if manager.n_timesteps > 0 else int(hyperparams["n_timesteps"])
+    steps = _steps(manager, hyperparams)
     # Otherwise rl_zoo3 has drawn one.
     seed = manager.seed if any(option.split("=")[0] == "--seed" for option in sys.argv) else None
     run = resuming.latest_unfinished(manager.log_path, manager.env_name, config, steps, seed, manager.trained_agent)
@@ -153,7 +161,7 @@ def _find_run(manager: Any, config: dict[str, Any], hyperparams: dict[str, Any])
     return run
 
 
-def _go_on(manager: Any, run: Path) -> None:
+def _go_on(manager: Any, run: Path, steps: int) -> None:
     """In the run's own folder, where rl_zoo3 would begin a new one.
 
     :raises ValueError: for a run that is still going
@@ -162,6 +170,8 @@ def _go_on(manager: Any, run: Path) -> None:
         raise ValueError(f"Another process is at work in {run}.")
     manager.save_path, manager.params_path = str(run), str(run / manager.env_name)
     if resuming.has_checkpoint(run):
+        if (done := steps_done(run / CHECKPOINT)) >= steps:
+            print(f"{run} has done {done} of {steps} steps: -n makes it longer.")
         manager.resumed_run, manager.continue_training = run, True
     else:
         print(f"{run} has no checkpoint yet: the run begins.")
@@ -178,7 +188,7 @@ def _save_config(original: Callable[..., Any], manager: Any, config: dict[str, A
 def _create_envs(original: Callable[..., Any], manager: Any, *args: Any, **kwargs: Any) -> VecEnv:
     """``--vec-env subproc`` survives processes that die or hang; a run that goes on keeps the episodes it had."""
     if getattr(manager, "resumed_run", None) is not None and not (kwargs.get("eval_env") or kwargs.get("no_log")):
-        resuming.put_monitor_files_aside(manager.resumed_run)
+        put_monitor_files_aside(manager.resumed_run)
     if manager.vec_env_class is SubprocVecEnv:
         manager.vec_env_class = SupervisedVecEnv
     if kwargs.get("eval_env") or kwargs.get("no_log") or getattr(manager, "pretrain_env", None) is None:

@@ -7,23 +7,24 @@ rl_zoo3 gives every run a folder, ``logs/dreamerv2/<env>_<number>``, with its co
 from __future__ import annotations
 
 import argparse
-import csv
-import io
-import itertools
-import json
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, PRETRAINING_LOGS, SNAPSHOT, RunFolder, steps_done
-from sb3_dreamer_urlb.snapshots.atomic import written_atomically
+from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, SNAPSHOT, RunFolder, steps_done, written_at
+from sb3_dreamer_urlb.snapshots.archive import SnapshotError
 
 AUTO = "auto"
 #: options that say how a run begins, or something else than to train; not taken from the run that goes on
 OTHER = ("trained_agent", "conf_file", "hyperparams", "optimize_hyperparameters", "trial_id", "storage", "study_name", "uuid")
+#: what a run keeps, and the option that says it
+KEPT = {"seed": "--seed", "env_kwargs": "--env-kwargs"}
+#: of a configuration: what a run that goes on may have otherwise, for it is none of the model's hyperparameters
+MAY_CHANGE = ("n_timesteps", "callback", "checkpoint", "resume")
 
 #: YAML as rl_zoo3 dumps it, and no code: its own way of reading would run whatever a file says
 _LOADER: Any = type("PlainLoader", (yaml.SafeLoader,), {})
@@ -99,7 +100,7 @@ def with_runs(parse: Callable[..., argparse.Namespace]) -> Callable[..., argpars
             parser.error(f"-i {given}: there is none; expected the .zip of a snapshot, the folder of a run, or 'auto'")
         try:
             run = run_at(given)
-            before = {} if run is None else saved(run, "args")
+            before = {} if run is None else _options_of(run, options)
         except ValueError as error:
             parser.error(str(error))
         if run is None:
@@ -112,12 +113,27 @@ def with_runs(parse: Callable[..., argparse.Namespace]) -> Callable[..., argpars
         options = parse(parser, args, namespace)
         if options.env != before.get("env") or options.algo != before.get("algo"):
             parser.error(f"the run in {run} is --algo {before.get('algo')} --env {before.get('env')}")
+        for name, option in KEPT.items():
+            if has_checkpoint(run) and getattr(options, name, None) != before.get(name):
+                its, given = before.get(name), getattr(options, name)
+                parser.error(f"the run in {run} has {option} {its}, a run keeps it: {option} {given} is for another one")
         options.run_folder = str(run)
         # Killed before its first checkpoint, a run begins again as it began.
         options.trained_agent = "" if has_checkpoint(run) else before.get("trained_agent", "")
         return options
 
     return parse_args
+
+
+def _options_of(run: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """As they were when the run began; those of this command, where its file is damaged and a configuration is named."""
+    try:
+        return saved(run, "args")
+    except ValueError as error:
+        if getattr(given, "conf_file", None) is None:
+            raise
+        warnings.warn(f"{error} The options of this command count.")
+        return dict(vars(given))
 
 
 def latest_unfinished(
@@ -134,17 +150,42 @@ def latest_unfinished(
     :return: the newest that is neither finished nor still going; None if there is none
     """
     runs = [run for run in Path(log_path).glob(f"{env_name}_*") if has_checkpoint(run) and [*run.glob("*/args.yml")]]
-    for run in sorted(runs, key=lambda run: (run / CHECKPOINT / SNAPSHOT).stat().st_mtime, reverse=True):
-        options = saved(run, "args")
+    for run in sorted(runs, key=lambda run: written_at(run / CHECKPOINT), reverse=True):
+        try:
+            options, done = saved(run, "args"), steps_done(run / CHECKPOINT)
+        except (ValueError, SnapshotError) as error:
+            warnings.warn(f"{run} is passed over: {error}")
+            continue
         same = _without_resume(saved(run, "config")) == _without_resume(config)
         same = same and (seed is None or options.get("seed") == seed) and options.get("trained_agent") == trained_agent
-        if same and not is_going(run) and steps_done(run / CHECKPOINT) < steps:
+        if same and not is_going(run) and done < steps:
             return run
     return None
 
 
 def _without_resume(config: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in config.items() if name != "resume"}
+
+
+def check_same(run: Path, hyperparams: dict[str, Any], changed: dict[str, Any] | None) -> None:
+    """Whether another configuration than the run's own says the same about the model.
+
+    :param run: that goes on
+    :param hyperparams: of the configuration
+    :param changed: what ``-params`` changes, which is meant
+    :raises ValueError: naming what differs
+    """
+    try:
+        own = saved(run, "config")
+    except ValueError:
+        return  # the model is the checkpoint's in any case
+    names = {*own, *hyperparams} - {*MAY_CHANGE, *(changed or {})}
+    if wrong := sorted(name for name in names if own.get(name) != hyperparams.get(name)):
+        its, given = (", ".join(f"{name}={of.get(name)!r}" for name in wrong) for of in (own, hyperparams))
+        raise ValueError(
+            f"The run in {run} has {its}, this configuration {given}: a run keeps its hyperparameters. Without -conf its own "
+            "are read, -params changes one."
+        )
 
 
 def is_going(run: Path) -> bool:
@@ -154,34 +195,3 @@ def is_going(run: Path) -> bool:
             return False
     except RuntimeError:
         return True
-
-
-def put_monitor_files_aside(run: Path) -> None:
-    """Keep SB3's Monitor from writing over what it wrote before the run was cut off.
-
-    Episodes after the checkpoint go: they will be played again. Each process's episodes get a file of their own, because
-    their times count from its start; whoever reads ``*.monitor.csv`` reads them all.
-
-    :param run: its folder, with a checkpoint
-    """
-    until = (run / CHECKPOINT / SNAPSHOT).stat().st_mtime
-    for file in sorted([*run.glob("*.monitor.csv"), *(run / PRETRAINING_LOGS).glob("*.monitor.csv")]):
-        number = file.name.removesuffix(".monitor.csv")
-        header, _, rest = file.read_text().partition("\n")
-        if not number.isdigit() or not header.startswith("#"):
-            continue
-        start = json.loads(header[1:])["t_start"]
-        kept = io.StringIO()
-        reader = csv.DictReader(io.StringIO(rest))
-        writer = csv.DictWriter(kept, reader.fieldnames or (), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(row for row in reader if row["t"] and start + float(row["t"]) <= until)
-        with written_atomically(file) as target:
-            target.write(f"{header}\n{kept.getvalue()}".encode())
-        file.rename(_unused(file.parent, f"{number}.before_{int(until)}"))
-
-
-def _unused(run: Path, name: str) -> Path:
-    """Whoever goes on twice from one checkpoint has two files to put aside."""
-    names = (f"{name}{again}.monitor.csv" for again in itertools.chain([""], (f"_{i}" for i in itertools.count(2))))
-    return next(run / free for free in names if not (run / free).exists())

@@ -77,6 +77,58 @@ def test_a_run_of_other_arguments_is_refused(tiny_model, tmp_path):
     assert model.num_timesteps == 60 and model.tensorboard_log == str(tmp_path / "tb")
 
 
+def test_a_run_keeps_its_task(tiny_model, tmp_path):
+    def env(task):
+        return vec_env(domain="walker", task=task)
+
+    def learn(task, steps):
+        return tiny_model(env(task)).learn(steps, callback=RunCheckpointCallback(tmp_path, resume="auto"))
+
+    learn("stand", 40)
+    before = (tmp_path / SNAPSHOT).read_bytes()
+    said = "has learnt walker-stand so far, and its environment is now of walker-run: a run keeps its task"
+    with pytest.raises(ValueError, match=said):
+        learn("run", 60)
+    model = DreamerV2.resume(tmp_path, env("run"))
+    with pytest.raises(ValueError, match=said):
+        model.learn(20, callback=RunCheckpointCallback(tmp_path), reset_num_timesteps=False)
+    assert (tmp_path / SNAPSHOT).read_bytes() == before
+    assert learn("stand", 60).num_timesteps == 60
+    # Who takes another environment himself may mean it.
+    model = DreamerV2.load(tmp_path / SNAPSHOT, env=env("run"))
+    with pytest.warns(UserWarning, match="its critic and its replay know the other's rewards"):
+        model.learn(20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(20)
+
+
+def test_exploring_is_of_no_task(tiny_model, tmp_path):
+    def learn(task, steps, then):
+        callbacks = [
+            RunCheckpointCallback(tmp_path, resume="auto"),
+            PhaseSwitchCallback(40, vec_env(domain="walker", task=then)),
+        ]
+        return tiny_model(vec_env(domain="walker", task=task), intrinsic_reward="lbs").learn(steps, callback=callbacks)
+
+    learn("stand", 20, "run")
+    learn("walk", 60, "run")
+    assert learn("stand", 80, "run").learnt_task == "walker-run"
+    with pytest.raises(ValueError, match="has learnt walker-run so far, and its environment is now of walker-flip"):
+        learn("stand", 100, "flip")
+
+
+def test_a_replay_without_its_checkpoint_is_not_removed(tiny_model, tmp_path):
+    tiny_model(vec_env()).learn(60, callback=RunCheckpointCallback(tmp_path, 20))
+    (tmp_path / SNAPSHOT).rename(tmp_path / "elsewhere.zip")
+    replay = sorted((tmp_path / "replay").iterdir())
+    with pytest.raises(ValueError, match=r"holds the replay of a run without its checkpoint: put snapshot\.zip back"):
+        tiny_model(vec_env()).learn(60, callback=RunCheckpointCallback(tmp_path, 20))
+    assert sorted((tmp_path / "replay").iterdir()) == replay
+    (tmp_path / "elsewhere.zip").rename(tmp_path / SNAPSHOT)
+    assert tiny_model(vec_env()).learn(80, callback=RunCheckpointCallback(tmp_path, resume="auto")).num_timesteps == 80
+
+
 def test_what_is_due_every_so_many_steps_stays_so(tiny_model, tmp_path):
     def callbacks():
         evaluation = EvalCallback(vec_env(), eval_freq=30, n_eval_episodes=1, verbose=0, warn=False, log_path=str(tmp_path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -23,10 +25,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from whole_runs import RepeatingEnv, everything
 from zoo_commands import CONFIGS, FLIP, STAND, TINY, TRAIN, latest_run, model_in, train
 
-from sb3_dreamer_urlb import DreamerV2
+from sb3_dreamer_urlb import DreamerV2, RunCheckpointCallback
 from sb3_dreamer_urlb.runs.run_folder import CHECKPOINT, RunFolder, steps_done
 from sb3_dreamer_urlb.zoo import resuming
 from sb3_dreamer_urlb.zoo.__main__ import main
+from sb3_dreamer_urlb.zoo.monitor_files import put_monitor_files_aside
 
 #: two frames a step: a checkpoint whenever an episode of 20 steps ends
 EVERY = "checkpoint:dict(every_frames=40)"
@@ -249,28 +252,105 @@ def test_ctrl_c_leaves_a_run_that_goes_on(repeating, monkeypatch):
     assert latest_run(STAND) == run and 60 <= model_in(run).num_timesteps < 65
 
 
-def test_monitor_files_lose_what_came_after_the_checkpoint(tmp_path):
+@pytest.fixture
+def folder(tmp_path):
+    """Of a run whose checkpoint was written 2000 seconds after 1970, whatever its file says."""
     (tmp_path / "checkpoint").mkdir()
-    (tmp_path / "checkpoint" / "snapshot.zip").touch()
-    os.utime(tmp_path / "checkpoint" / "snapshot.zip", (2000, 2000))
-    rows = "r,l,t\n1.0,20,3.5\n2.0,20,999.0\n3.0,20,1001.0\n4.0,2"  # the last one cut off
-    (tmp_path / "0.monitor.csv").write_text(f"#{json.dumps({'t_start': 1000.0})}\n{rows}")
-    (tmp_path / "eval.monitor.csv").write_text("something else")
-    resuming.put_monitor_files_aside(tmp_path)
-    assert not (tmp_path / "0.monitor.csv").exists() and (tmp_path / "eval.monitor.csv").exists()
-    kept = pandas.read_csv(tmp_path / "0.before_2000.monitor.csv", skiprows=1)
+    with mock.patch("time.time", lambda: 2000.0):
+        model = DreamerV2("MlpPolicy", "CartPole-v1", preset="tiny", device="cpu")
+        model.learn(4, callback=RunCheckpointCallback(tmp_path / "checkpoint"))
+    return tmp_path
+
+
+def monitor_file(rows, start=1000.0):
+    return f"#{json.dumps({'t_start': start})}\nr,l,t\n{rows}"
+
+
+@pytest.mark.parametrize("copied_at", [1, 1500, 10**9])
+def test_monitor_files_lose_what_came_after_the_checkpoint(folder, copied_at):
+    os.utime(folder / "checkpoint" / "snapshot.zip", (copied_at, copied_at))
+    rows = "1.0,20,3.5\n2.0,20,999.0\n3.0,20,1001.0\n4.0,2"  # the last one cut off
+    (folder / "0.monitor.csv").write_text(monitor_file(rows))
+    (folder / "eval.monitor.csv").write_text("something else")
+    put_monitor_files_aside(folder)
+    assert not (folder / "0.monitor.csv").exists() and (folder / "eval.monitor.csv").exists()
+    kept = pandas.read_csv(folder / "0.before_2000.monitor.csv", skiprows=1)
     assert kept["r"].tolist() == [1.0, 2.0] and kept["t"].tolist() == [3.5, 999.0]
+    # Nothing is lost.
+    assert (folder / "0.undone_2000").read_text().splitlines()[2:] == ["3.0,20,1001.0", "4.0,2"]
 
 
-def test_monitor_files_of_two_tries_from_one_checkpoint_are_all_kept(tmp_path):
-    (tmp_path / "checkpoint").mkdir()
-    (tmp_path / "checkpoint" / "snapshot.zip").touch()
-    os.utime(tmp_path / "checkpoint" / "snapshot.zip", (2000, 2000))
+def test_monitor_files_of_two_tries_from_one_checkpoint_are_all_kept(folder):
     for reward in (1.0, 2.0, 3.0):
-        (tmp_path / "0.monitor.csv").write_text(f"#{json.dumps({'t_start': 1000.0})}\nr,l,t\n{reward},20,3.5\n")
-        resuming.put_monitor_files_aside(tmp_path)
-    files = sorted(tmp_path.glob("*.monitor.csv"))
+        (folder / "0.monitor.csv").write_text(monitor_file(f"{reward},20,3.5\n4.0,20,1002\n"))
+        put_monitor_files_aside(folder)
+    files = sorted(folder.glob("*.monitor.csv"))
     assert sorted(pandas.read_csv(file, skiprows=1)["r"].item() for file in files) == [1.0, 2.0, 3.0]
+    assert len(list(folder.glob("0.undone_2000*"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("#{'t_start'", None),
+        ("#{}\nr,l,t\n1.0,20,3.5\n", None),
+        ("#[1]\nr,l,t\n1.0,20,3.5\n", None),
+        (monitor_file("5.0,5,abc\n1.0,20,3.5\n"), ["1.0,20,3.5"]),
+        (monitor_file("5.0,5,4.5\0\n1.0,20,3.5\n"), ["5.0,5,4.5", "1.0,20,3.5"]),
+        (f"#{json.dumps({'t_start': 1000.0})}\n", []),
+    ],
+)
+def test_a_damaged_monitor_file_stops_no_run(folder, text, kept):
+    (folder / "0.monitor.csv").write_text(text)
+    with pytest.warns(UserWarning, match="0.monitor.csv cannot be read") if kept is None else contextlib.nullcontext():
+        put_monitor_files_aside(folder)
+    if kept is None:
+        assert (folder / "0.damaged_2000").read_text() == text and not list(folder.glob("*.monitor.csv"))
+    else:
+        assert (folder / "0.before_2000.monitor.csv").read_text().splitlines()[2:] == kept
+
+
+def test_a_run_keeps_what_it_began_with(repeating, tmp_path, capsys):
+    config = tmp_path / "conf.yml"
+    config.write_text(f"{STAND}:\n  policy: CnnPolicy\n  preset: tiny\n  n_timesteps: 24\n  batch_size: 2\n")
+    command = ["train", "--algo", "dreamerv2", "--env", STAND, "-conf", str(config), "--seed", "3"]
+    repeating(*command)
+    run = latest_run(STAND)
+    again = [*command[:5], "-i", str(run), "-n", "32"]
+    other = tmp_path / "other.yml"
+    other.write_text(config.read_text().replace("batch_size: 2", "batch_size: 3\n  learning_rate: 0.1"))
+    for wrong, message in {
+        (
+            "-conf",
+            str(other),
+        ): "has batch_size=2, learning_rate=None, this configuration batch_size=3, learning_rate=0.1",
+        ("--seed", "4"): f"the run in {run} has --seed 3, a run keeps it: --seed 4 is for another one",
+        ("--env-kwargs", "length:9"): "has --env-kwargs None, a run keeps it: --env-kwargs {'length': 9} is for another one",
+    }.items():
+        with pytest.raises(SystemExit):
+            repeating(*again, *wrong)
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert model_in(run).num_timesteps == 24
+    repeating(*again[:-2])
+    assert "has done 24 of 24 steps: -n makes it longer" in capsys.readouterr().out
+    repeating(*again, "-conf", str(config), "--seed", "3")
+    assert model_in(run).num_timesteps == 32
+    # The advice of a damaged file works.
+    [args] = run.glob("*/args.yml")
+    args.write_text("")
+    with pytest.warns(UserWarning, match="args.yml cannot be read.*The options of this command count"):
+        repeating(*again[:-1], "40", "-conf", str(config), "--seed", "3")
+    assert model_in(run).num_timesteps == 40
+
+
+def test_a_damaged_run_is_passed_over(repeating, crashing):
+    params = [*TINY, EVERY]
+    first = crashed(crashing, 30, repeating, STAND, 60, "lbs", "-i", "auto", params=params)
+    second = crashed(crashing, 30, repeating, STAND, 60, "lbs", "-i", "auto", "--seed", "5", params=params)
+    (second / "checkpoint" / "snapshot.zip").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match=f"{second} is passed over"):
+        train(repeating, STAND, 60, "lbs", "-i", "auto", params=params)
+    assert model_in(first).num_timesteps == 60
 
 
 # -- trials that learn nothing ---------------------------------------------------------------------------------------------
