@@ -12,7 +12,10 @@ def check_folder(argument: str, path: str | os.PathLike[str]) -> None:
     :param argument: what the path was given as, for the message
     :param path: of the folder
     :raises NotADirectoryError: naming the file that has its name, or that of a folder around it
+    :raises ValueError: for what is no path
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{argument} must be the path of a folder, got {path!r}.")
     folder = Path(path)
     # os.path: what may not be looked at is for whoever writes to find out.
     file = next((part for part in (folder, *folder.parents) if os.path.exists(part) and not os.path.isdir(part)), None)

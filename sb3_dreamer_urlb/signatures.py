@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from sb3_dreamer_urlb.unknown_names import check_keys
+from sb3_dreamer_urlb.unknown_names import check_keys, unexpected_arguments
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing_extensions import ParamSpec, Self
+
+    Given = ParamSpec("Given")
+
+Returned = TypeVar("Returned")
 
 NAMELESS = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -58,6 +63,23 @@ def check_keywords(kind: type, given: Iterable[str], filled_in: Iterable[str] = 
     takes_any = any(parameter.kind == inspect.Parameter.VAR_KEYWORD for parameter in parameters)
     if not takes_any or maker.__module__.partition(".")[0] == __name__.partition(".")[0]:
         check_keys("arguments", given, named_parameters(kind).keys() - {*filled_in}, kind.__name__)
+
+
+def answering_unknown_keywords(method: Callable[Given, Returned]) -> Callable[Given, Returned]:
+    """Let a method answer a keyword that there is not with near ones.
+
+    :param method: that takes no ``**kwargs``
+    """
+    known = [*inspect.signature(method).parameters][1:]
+
+    @functools.wraps(method)
+    def wrapped(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        if unknown := [name for name in kwargs if name not in known]:
+            caller = f"{type(args[0]).__name__}.{method.__name__}"
+            raise unexpected_arguments(caller, unknown, known, f"help({caller})")
+        return method(*args, **kwargs)
+
+    return wrapped
 
 
 class WithKnownKeywords:

@@ -16,6 +16,14 @@ from sb3_dreamer_urlb.folders import check_file, check_folder, made_folder
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
 
 
+@pytest.mark.parametrize("path", [5, None, ["a"]])
+def test_what_is_no_path_is_named(path):
+    with pytest.raises(ValueError, match="folder must be the path of a folder, got"):
+        check_folder("folder", path)
+    with pytest.raises(ValueError, match="folder must be the path of a folder, got"):
+        RunCheckpointCallback(path)
+
+
 def model(algorithm=DreamerV2, **kwargs):
     return algorithm("CnnPolicy", CounterEnv(), preset="tiny", device="cpu", **kwargs)
 

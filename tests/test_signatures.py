@@ -10,7 +10,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
 import sb3_dreamer_urlb
-from sb3_dreamer_urlb import EvaluationCallback, PhaseSwitchCallback
+from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback
 from sb3_dreamer_urlb.signatures import check_keywords, named_parameters
 from sb3_dreamer_urlb.unknown_names import UnknownNameError
 from sb3_dreamer_urlb.zoo.callbacks import RunSnapshotCallback
@@ -56,3 +56,12 @@ def test_who_takes_any_keyword_is_asked_itself():
     check_keywords(EvalCallback, ["eval_freq"], ["eval_env"])
     with pytest.raises(UnknownNameError, match="for EvalCallback"):
         check_keywords(EvalCallback, ["eval_env"], ["eval_env"])
+
+
+@pytest.mark.parametrize(("method", "near"), [("fine_tune", "keep_actor"), ("learn", "callback"), ("learn", "log_interval")])
+def test_methods_propose_what_is_near(method, near):
+    model = DreamerV2("MlpPolicy", "CartPole-v1", preset="tiny", device="cpu")
+    said = rf"DreamerV2.{method}: got an unexpected keyword argument '{near}x'. Did you mean '{near}'"
+    with pytest.raises(UnknownNameError, match=said):
+        getattr(model, method)(**{f"{near}x": 1})
+    assert near in inspect.signature(getattr(model, method)).parameters

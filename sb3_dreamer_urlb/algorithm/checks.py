@@ -5,17 +5,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import gymnasium
-import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.envs.normalized import hides_originals
-from sb3_dreamer_urlb.envs.registration import naming_near_ids
 from sb3_dreamer_urlb.folders import check_folder
 from sb3_dreamer_urlb.learning.graphs import COMPILE
 from sb3_dreamer_urlb.nn.precision import PRECISIONS
@@ -32,7 +24,6 @@ from sb3_dreamer_urlb.phases import PHASES, PRETRAINING
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
 from sb3_dreamer_urlb.signatures import named_parameters
 from sb3_dreamer_urlb.snapshots.saved_algorithm import SavedAlgorithm
-from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 from sb3_dreamer_urlb.unknown_names import UnknownNameError, check_keys, unexpected_arguments
 
 #: arguments of every replay that the algorithm fills in itself
@@ -81,70 +72,6 @@ def check_learn(total_timesteps: Any, log_interval: Any, callback: Any = None, *
         check_integer("log_interval", log_interval, 1)
     for name, value in switches.items():
         check_switch(name, value)
-
-
-def given_env(env: Any, argument: str = "env") -> GymEnv:
-    """What a user gave as an environment, wherever one is taken: before Stable-Baselines3 wraps it, and makes arrays for its
-    observations.
-
-    :param env: an environment, vectorised or not, or its id
-    :param argument: what the user calls it, for messages
-    :return: the environment; of an id, one that can be filmed where it knows how
-    :raises UnsupportedSpaceError: for observations that no array can hold: Text, Sequence, Graph
-    :raises ValueError: for environments that Gymnasium vectorised, and for what is no environment
-    """
-    if isinstance(env, type):
-        raise ValueError(f"{argument} must be an environment, got the class {env.__qualname__}: {env.__qualname__}() is one.")
-    if not isinstance(env, str) and not hasattr(env, "step"):
-        raise ValueError(f"{argument} must be an environment of Gymnasium, a VecEnv or an id, got {env!r}.")
-    with naming_near_ids(str(env)):
-        env = maybe_make_env(env, 0)
-    if isinstance(env, gymnasium.vector.VectorEnv):
-        raise ValueError(
-            f"{argument} is vectorised by Gymnasium, a {type(env).__name__}, which resets otherwise than Stable-Baselines3 "
-            "does: make it with make_vec_env, DummyVecEnv or SubprocVecEnv of stable_baselines3."
-        )
-    space = getattr(env, "observation_space", None)
-    check_equal_spaces(env, argument)
-    parts = space.spaces.items() if isinstance(space, spaces.Dict) else [("", space)]
-    for name, part in parts:
-        if isinstance(part, spaces.Space) and not isinstance(part, spaces.Dict | spaces.Tuple) and part.shape is None:
-            which = f"The observation {name!r} must be an array" if name else "Observations must be arrays"
-            raise UnsupportedSpaceError(f"{which} of numbers, or several by name in a Dict, got {part}.")
-    return env  # type: ignore[no-any-return]
-
-
-def check_equal_spaces(env: Any, argument: str) -> None:
-    """Whether the environments of a VecEnv are alike, as far as they are in this process; a VecEnv looks at the first only.
-
-    :param env: vectorised or not
-    :param argument: see :func:`given_env`
-    :raises ValueError: naming the first that has other spaces
-    """
-    inner = env.unwrapped if isinstance(env, VecEnv) else None
-    envs = inner.envs if isinstance(inner, DummyVecEnv) else []
-    for i, one in enumerate(envs):
-        for name in ("observation_space", "action_space"):
-            first, its = getattr(envs[0], name), getattr(one, name)
-            if its != first:
-                raise ValueError(f"{argument} must have one {name}: environment {i} has {its}, environment 0 {first}.")
-
-
-def check_keeps_fractions(env: VecEnv) -> None:
-    """
-    :param env: vectorised
-    :raises UnsupportedSpaceError: where a wrapper outside of VecNormalize says that observations are whole numbers
-    """
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is None or not normalizer.norm_obs or not hides_originals(env, normalizer):
-        return
-    space: Any = env.observation_space
-    for part in space.spaces.values() if isinstance(space, spaces.Dict) else [space]:
-        if isinstance(part, spaces.Box) and not np.issubdtype(part.dtype, np.floating):
-            raise UnsupportedSpaceError(
-                f"VecNormalize gives fractions, and the wrapper outside of it says that they are {part.dtype}: {part}. "
-                "Put VecNormalize outermost, or let the environment give float32."
-            )
 
 
 def check_settings(model: SavedAlgorithm) -> None:
@@ -334,15 +261,18 @@ def check_pretrains(model: SavedAlgorithm) -> None:
     )
 
 
-def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any]) -> None:
+def check_load_keywords(algorithm: type[SavedAlgorithm], kwargs: dict[str, Any], method: str) -> None:
     """SB3 would silently set any keyword as an attribute.
 
+    :param algorithm: whose
+    :param kwargs: of the call
+    :param method: that was called, ``load`` or ``resume``
     :raises UnknownNameError: for a keyword that is no constructor argument, or one that only makes sense there
     """
     me = algorithm.__name__
     for name, why in NOT_CHANGED.items():
         if name in kwargs:
-            raise UnknownNameError(f"{me}.load: got an unexpected keyword argument {name!r}: {why.format(me=me)}.")
+            raise UnknownNameError(f"{me}.{method}: got an unexpected keyword argument {name!r}: {why.format(me=me)}.")
     known = [*algorithm.argument_names(), "device"]
     if unknown := [name for name in kwargs if name not in known]:
-        raise unexpected_arguments(f"{me}.load", unknown, known, f"help({me})", algorithm.names_within())
+        raise unexpected_arguments(f"{me}.{method}", unknown, known, f"help({me})", algorithm.names_within())

@@ -9,10 +9,10 @@ import torch as th
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dreamer_urlb.algorithm import advice, checks, left_environments, normalized
+from sb3_dreamer_urlb.algorithm import advice, left_environments, normalized
 from sb3_dreamer_urlb.algorithm.assignable_arguments import AssignableArguments
 from sb3_dreamer_urlb.algorithm.collecting import CollectingAlgorithm
-from sb3_dreamer_urlb.algorithm.environment_checks import check_env
+from sb3_dreamer_urlb.algorithm.environment_checks import check_env, check_keeps_fractions, given_env
 from sb3_dreamer_urlb.envs.facts import env_fact
 from sb3_dreamer_urlb.envs.naming import task_of
 from sb3_dreamer_urlb.envs.normalized import watch_ends
@@ -30,8 +30,8 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        wrapped = CollectingAlgorithm._wrap_env(checks.given_env(env), verbose, monitor_wrapper)
-        checks.check_keeps_fractions(wrapped)
+        wrapped = CollectingAlgorithm._wrap_env(given_env(env), verbose, monitor_wrapper)
+        check_keeps_fractions(wrapped)
         return wrapped
 
     def prepare_env(self, env: GymEnv | str) -> VecEnv:

@@ -26,6 +26,7 @@ from sb3_dreamer_urlb.learning.numerical_faults import NumericalFaultError, Upda
 from sb3_dreamer_urlb.number_checks import check_dict, plain
 from sb3_dreamer_urlb.runs.last_state import save_last_good_state
 from sb3_dreamer_urlb.runs.resuming import resume_if_asked
+from sb3_dreamer_urlb.signatures import answering_unknown_keywords
 from sb3_dreamer_urlb.snapshots.saved_algorithm import builds_networks
 from sb3_dreamer_urlb.types import MetricMeans
 from sb3_dreamer_urlb.unknown_names import did_you_mean
@@ -165,6 +166,7 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
             )
         super().__setattr__(name, value)
 
+    @answering_unknown_keywords
     def fine_tune(
         self,
         env: GymEnv | str | None = None,
@@ -246,6 +248,7 @@ class PhasedAlgorithm(EnvironmentAlgorithm):
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
+    @answering_unknown_keywords
     def learn(
         self: SelfPhasedAlgorithm,
         total_timesteps: int,

@@ -77,7 +77,7 @@ class SavingAlgorithm(RunningAlgorithm):
         :raises TypeError: for a keyword that is no constructor argument
         :raises SnapshotError: naming the file and why it is refused
         """
-        check_load_keywords(cls, kwargs)
+        check_load_keywords(cls, kwargs, "load")
         model = model_snapshot.load(cls, path, env, device, custom_objects, print_system_info, kwargs)[0]
         if model.env is not None:
             model._go_on_normalized(model.loaded_statistics)
@@ -107,7 +107,7 @@ class SavingAlgorithm(RunningAlgorithm):
         :raises SnapshotError: naming the file and why it is refused
         :raises RuntimeError: if the run is still going
         """
-        check_load_keywords(cls, kwargs)
+        check_load_keywords(cls, kwargs, "resume")
         resumed = run_folder.resume(
             cls, folder, env, device=device, custom_objects=custom_objects, print_system_info=False, kwargs=kwargs
         )

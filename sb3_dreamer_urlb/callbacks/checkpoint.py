@@ -59,6 +59,8 @@ class RunCheckpointCallback(WithKnownKeywords, BetweenRolloutsCallback, Resuming
             raise ValueError(f"resume must be 'auto' or None, got {resume!r}.")
         self.resume = resume
         check_folder("folder", folder)
+        if evaluation is not None and not isinstance(evaluation, EvalCallback):
+            raise ValueError(f"evaluation must be an EvalCallback or None, got {evaluation!r}.")
         self.folder = Path(folder)
         self.every_frames = every_frames
         self.evaluation = evaluation

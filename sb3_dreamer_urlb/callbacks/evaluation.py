@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.algorithm.checks import given_env
+from sb3_dreamer_urlb.algorithm.environment_checks import given_env
 from sb3_dreamer_urlb.evaluation.agent_rows import row_of
 from sb3_dreamer_urlb.evaluation.append import RowsDisagree, append_row, check_can_append
 from sb3_dreamer_urlb.evaluation.episodes import (

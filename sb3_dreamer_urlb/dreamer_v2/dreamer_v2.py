@@ -27,7 +27,7 @@ from sb3_dreamer_urlb.learning.learner import Learner, LearnerConfig
 from sb3_dreamer_urlb.nn.nets import MLP
 from sb3_dreamer_urlb.planning import Planner, PlannerConfig, make_planner
 from sb3_dreamer_urlb.replay import SequenceReplayBuffer
-from sb3_dreamer_urlb.signatures import constructed
+from sb3_dreamer_urlb.signatures import answering_unknown_keywords, constructed
 from sb3_dreamer_urlb.spaces.actions import make_actions
 
 SelfDreamerV2 = TypeVar("SelfDreamerV2", bound="DreamerV2")
@@ -422,6 +422,7 @@ class DreamerV2(AgentAlgorithm):
 
     # -- learning ------------------------------------------------------------------------------------------------------
 
+    @answering_unknown_keywords
     def learn(
         self: SelfDreamerV2,
         total_timesteps: int,

@@ -20,7 +20,7 @@ from sb3_dreamer_urlb.drq_v2.policies import CnnPolicy, DrQPolicy, MlpPolicy
 from sb3_dreamer_urlb.drq_v2.presets import MADE_FOR, PRESETS, with_preset
 from sb3_dreamer_urlb.intrinsic import TransitionReward, make_intrinsic_reward
 from sb3_dreamer_urlb.replay.n_step import NStepFrameReplayBuffer
-from sb3_dreamer_urlb.signatures import constructed
+from sb3_dreamer_urlb.signatures import answering_unknown_keywords, constructed
 
 SelfDrQv2 = TypeVar("SelfDrQv2", bound="DrQv2")
 
@@ -273,6 +273,7 @@ class DrQv2(AgentAlgorithm):
     def _learning_rates(self, remaining: float) -> dict[str, float]:
         return dict.fromkeys(self.learner.optimizers(), self.lr_schedule(remaining))
 
+    @answering_unknown_keywords
     def learn(
         self: SelfDrQv2,
         total_timesteps: int,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import inspect
 import math
 import warnings
 import weakref
@@ -24,6 +25,8 @@ from stable_baselines3.common.vec_env.util import dict_to_obs, obs_space_info
 from sb3_dreamer_urlb.envs.faults import FAULT, FAULTS, EnvironmentFaultError, FaultCounter, check_finite_action, closed
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL, TRUNCATED
 from sb3_dreamer_urlb.envs.worker import Worker, WorkerFault, end_all, start_context
+from sb3_dreamer_urlb.number_checks import check_integer
+from sb3_dreamer_urlb.unknown_names import check_keys
 
 #: seconds that close() gives workers before it ends them by force
 GRACE = 2.0
@@ -270,5 +273,10 @@ def make_supervised_vec_env(env_id: str | Callable[..., gymnasium.Env], n_envs: 
     :param n_envs: number of processes
     :param kwargs: of :func:`stable_baselines3.common.env_util.make_vec_env`; its ``vec_env_kwargs`` are
         :class:`SupervisedVecEnv`'s
+    :raises ValueError: for fewer than one process
+    :raises UnknownNameError: for another keyword
     """
+    check_integer("n_envs", n_envs, 1)
+    known = inspect.signature(make_vec_env).parameters.keys() | {"n_envs"}
+    check_keys("arguments", kwargs, known - {"vec_env_cls"}, "make_supervised_vec_env")
     return make_vec_env(env_id, n_envs, vec_env_cls=SupervisedVecEnv, **kwargs)  # type: ignore[arg-type]

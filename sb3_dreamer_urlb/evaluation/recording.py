@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.algorithm.checks import given_env
+from sb3_dreamer_urlb.algorithm.environment_checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
 from sb3_dreamer_urlb.envs.wrappers import put_around

@@ -103,5 +103,6 @@ class UpdateGuard:
         paid = f" {rewarded_by} may be what is not." if set(parts) <= BEHAVIOR else ""
         raise NumericalFaultError(
             f"At step {step}, {MAX_IN_A_ROW} or more updates in a row were skipped: the loss or the gradient of "
-            f"the {' and the '.join(parts)} was not finite.{paid} Smaller learning rates may help."
+            f"the {' and the '.join(parts)} was not finite.{paid} Smaller learning rates may "
+            "help, and rewards of the order of one."
         )

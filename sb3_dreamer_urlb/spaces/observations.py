@@ -122,6 +122,9 @@ class Images(Observations):
         assert isinstance(raw, th.Tensor)
         if self.dtype is not None and raw.dtype != self.dtype:
             raise ValueError(f"Images must be uint8 in [0, 255], got {raw.dtype}.")
+        if self.dtype is None and raw.dtype == th.uint8:
+            high = self.low + self.range
+            raise ValueError(f"Images must be numbers in [{self.low:g}, {high:g}], as the environment gives them, got uint8.")
 
 
 def _channels_somewhere(image: th.Tensor) -> th.Tensor:

@@ -263,7 +263,7 @@ def test_an_argument_that_it_has_not_is_named_with_those_that_are_near(
     for caller, call in (
         (me, lambda: make(algorithm, **{name: 1})),
         (f"{me}.load", lambda: algorithm.load(path, **{name: 1})),
-        (f"{me}.load", lambda: algorithm.resume(tmp_path, **{name: 1})),
+        (f"{me}.resume", lambda: algorithm.resume(tmp_path, **{name: 1})),
     ):
         with pytest.raises(TypeError) as caught:
             call()

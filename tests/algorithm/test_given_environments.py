@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import gymnasium
+import numpy as np
 import pytest
 from fake_envs import CounterEnv
+from gymnasium import spaces
 
 from sb3_dreamer_urlb import DreamerV2, EvaluationCallback, PhaseSwitchCallback
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.evaluation.recording import env_to_play_in
+from sb3_dreamer_urlb.spaces.errors import UnsupportedSpaceError
 
 ENV = "CartPole-v1"
+BOX = spaces.Box(-1, 1, (3,), np.float32)
 
 
 def tiny():
@@ -97,3 +101,19 @@ def test_what_gymnasium_answers_itself_stays(tiny_model):
     with pytest.raises(gymnasium.error.NameNotFound, match="qqqq") as error:
         tiny_model("qqqq")
     assert "did you mean" not in str(error.value).lower()
+
+
+@pytest.mark.parametrize("part", [spaces.Dict(hand=BOX), spaces.Tuple([BOX])])
+def test_what_is_nested_is_named_with_its_cure(part):
+    env = CounterEnv(observation_space=spaces.Dict(arm=part, leg=BOX))
+    with pytest.raises(UnsupportedSpaceError, match=r"The observation 'arm' must be an array, got .*FlattenObservation"):
+        DreamerV2("MultiInputPolicy", env, preset="tiny")
+
+
+def test_bytes_are_no_fractions():
+    """As the environment would have them after dividing by 255: the picture would be 255 times too bright."""
+    env = CounterEnv(observation_space=spaces.Box(0, 1, (3, 16, 16), np.float32))
+    model = DreamerV2("CnnPolicy", env, preset="tiny", policy_kwargs={"normalize_images": False}, device="cpu")
+    with pytest.raises(ValueError, match=r"Images must be numbers in \[0, 1\], as the environment gives them, got uint8"):
+        model.predict(np.full((3, 16, 16), 200, np.uint8))
+    model.predict(np.full((3, 16, 16), 0.8, np.float32))

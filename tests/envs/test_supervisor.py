@@ -265,3 +265,15 @@ def test_after_close_no_process_is_started():
             use()
     assert [worker.process.pid for worker in env.workers] == before and env.counters[0].in_a_row == 0
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"n_envs": 0}, "n_envs must be an integer of at least 1, got 0"),
+        ({"n_env": 2}, "Unknown arguments .*'n_env'.* mean 'n_envs'"),
+    ],
+)
+def test_arguments_that_cannot_be_meant(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_supervised_vec_env(functools.partial(CounterEnv, 20), **arguments)
