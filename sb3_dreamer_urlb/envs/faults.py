@@ -7,6 +7,7 @@ row (docs/reliability.md, "Environments that fail"). :class:`FaultGuard` does it
 
 from __future__ import annotations
 
+import copy
 import warnings
 from typing import Any
 
@@ -106,7 +107,7 @@ class FaultGuard(gymnasium.Wrapper):
             except Exception as error:
                 reason = self._fault(error)
             if reason is None:
-                self._last = observation
+                self._last = copy.deepcopy(observation)
                 return observation, info
             self.faults.bad(f"reset: {reason}")
             # The same seed would fail in the same way.
@@ -126,7 +127,8 @@ class FaultGuard(gymnasium.Wrapper):
         if reason is not None:
             text = self.faults.bad(reason)
             return self._last, 0.0, False, True, {FAULT: text, FAULTS: self.faults.take()}
-        self._last = observation
+        # Environments may write the next observation, good or bad, into the same array.
+        self._last = copy.deepcopy(observation)
         self.faults.good(terminated or truncated)
         if new := self.faults.take():
             info = {**info, FAULTS: new}

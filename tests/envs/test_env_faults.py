@@ -80,6 +80,30 @@ def test_a_bad_step_ends_the_episode_as_truncated(fault, reason):
     assert env.step(ACTION)[4] == {}
 
 
+@pytest.mark.parametrize("fault", ["gives NaN", "raises"])
+def test_the_last_good_observation_is_one_where_an_array_is_used_again(fault):
+    class InPlace(CounterEnv):
+        def __init__(self):
+            super().__init__(10, observation_space=VECTOR)
+            self.seen = np.zeros(3, np.float32)
+
+        def _observation(self):
+            self.seen[0] = self.t / 10
+            if self.t == 3:
+                self.seen[1] = math.nan if fault == "gives NaN" else 0.5
+                if fault == "raises":
+                    raise PhysicsError("half-way")
+            return self.seen
+
+    env = FaultGuard(InPlace())
+    env.reset()
+    for _ in range(2):
+        env.step(ACTION)
+    with pytest.warns(RuntimeWarning, match="step 3"):
+        observation, _, terminated, truncated, info = env.step(ACTION)
+    assert observation.tolist() == pytest.approx([0.2, 0, 0]) and (terminated, truncated) == (False, True) and FAULT in info
+
+
 def test_parts_of_a_dict_observation_are_named():
     class Parts(CounterEnv):
         def _observation(self):
