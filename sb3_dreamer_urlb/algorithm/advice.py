@@ -65,6 +65,17 @@ def warn_if_ends_go_unheeded(dones: np.ndarray, infos: list[dict[str, Any]]) -> 
         )
 
 
+def warn_of_hidden_rewards(phase: str) -> None:
+    """Where an agent learns a task's reward in an environment that was made to hide it.
+
+    :param phase: name of the phase
+    """
+    warnings.warn(
+        f"The environment was made with reward_free=True and pays 0 always, and the agent learns its reward in {phase}: make "
+        "one without for that."
+    )
+
+
 def warn_if_pictures_are_black(seen: Any, space: spaces.Space[Any]) -> None:
     """Where an environment gives numbers in [0, 1] as bytes, whose white is 255.
 

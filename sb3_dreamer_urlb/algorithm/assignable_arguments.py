@@ -62,7 +62,8 @@ class AssignableArguments(SavedAlgorithm):
         :raises AttributeError: for another policy, which nothing would train
         :raises ValueError: for a replay of another form, or of another phase; None is none
         """
-        if name == "policy" and part is not self.policy:
+        # One that was compiled has the same networks.
+        if name == "policy" and getattr(part, "agent", None) is not self.policy.agent:
             raise AttributeError(
                 "policy cannot be assigned: its networks are those that the learner trains. To take weights over: "
                 "model.policy.load_state_dict(other.state_dict()), model.set_parameters(...), or load a model."

@@ -43,6 +43,8 @@ class CollectingAlgorithm(SavingAlgorithm):
     env_faults: int
     #: ``<domain>-<task>`` of the present environment, None where it does not tell
     _task: str | None = None
+    #: whether that gives rewards of zero, whatever its task would pay; False once that was told
+    _hides_rewards = False
     #: see ``last_touches``; as of when the model itself last reset or stepped its environments
     _touches: tuple[int, ...] = ()
     #: see :meth:`_drawn_through`
@@ -181,11 +183,18 @@ class CollectingAlgorithm(SavingAlgorithm):
         assert self.env is not None
         return last_touches(self.env) != self._touches
 
+    def _learns_the_tasks_reward(self) -> bool:
+        """Whether what the environment pays is learnt in this phase, to be sought or for later."""
+        return not phases.PHASES[self.phase].explores
+
     def _note_task(self) -> None:
         """Remember whose rewards the agent learns from; nobody means to mix those of two tasks unawares.
 
         :raises ValueError: where a run goes on in another task
         """
+        if self._hides_rewards and self._learns_the_tasks_reward():
+            self._hides_rewards = False  # told once
+            advice.warn_of_hidden_rewards(self.phase)
         if phases.PHASES[self.phase].explores or self._task is None:
             return
         if self.learnt_task not in (None, self._task):

@@ -90,4 +90,5 @@ class EnvironmentAlgorithm(AssignableArguments, CollectingAlgorithm):
         self.action_repeat = env_fact(self.env, "action_repeat", 1)
         self.domain = env_fact(self.env, "domain", None)
         self._task = task_of(self.env)
+        self._hides_rewards = env_fact(self.env, "reward_free", False)
         advice.warn_if_no_episode_fits(self)

@@ -261,6 +261,10 @@ class DreamerV2(AgentAlgorithm):
     def _learns_of_ends(self) -> bool:
         return bool(self.discount_head)
 
+    def _learns_the_tasks_reward(self) -> bool:
+        # Rewards of named tasks come beside the environment's own, which may be hidden.
+        return super()._learns_the_tasks_reward() or self.learn_task_reward is True
+
     def _check_env(self, env: VecEnv) -> None:
         super()._check_env(env)
         arguments.check_episodes_fit(self.batch_length, self.replay_buffer_kwargs, env)
@@ -406,6 +410,8 @@ class DreamerV2(AgentAlgorithm):
         skills = self.policy.agent.skills
         if skills is None:
             raise ValueError(f"intrinsic_reward={self.intrinsic_reward!r} has no skills.")
+        if isinstance(skill, bool | np.bool_):
+            raise ValueError(f"skill must be numbers, the number of a skill, or None, got {skill!r}.")
         skills.fix(skills.numbered(int(skill)) if isinstance(skill, int | np.integer) else skill)
 
     def _choose_skill(self) -> None:

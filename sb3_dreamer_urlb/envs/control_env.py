@@ -79,6 +79,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
     ) -> None:
         self.domain, self.task = domain, task
         self.never_terminates = never_terminates
+        self.reward_free = options.reward_free
         self.action_repeat = int(options.action_repeat)
         self.max_episode_steps = _episode_length(control_env, self.action_repeat)
         self.render_mode = options.render_mode
@@ -175,7 +176,7 @@ class ControlEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
                 self._episode_over = True
                 break
         observation = self._observe(observed)
-        reward = 0.0 if self._options.reward_free else task_reward
+        reward = 0.0 if self.reward_free else task_reward
         info: dict[str, Any] = {"task_reward": task_reward}
         if self.domain_rewards is not None:
             info[KEY] = others

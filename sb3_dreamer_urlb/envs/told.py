@@ -29,6 +29,7 @@ FACTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "max_episode_steps": (is_count, "a positive integer, agent steps an episode"),
     "task": (lambda value: isinstance(value, str), "the name of a task"),
     "never_terminates": (lambda value: isinstance(value, bool), "True or False"),
+    "reward_free": (lambda value: isinstance(value, bool), "True or False"),
 }
 #: gymnasium's own that are read, too
 OF_GYMNASIUM = ("spec", "metadata")

@@ -213,3 +213,32 @@ def test_ends_of_the_second_phase_are_told_where_the_first_had_none():
         model.fine_tune(env(terminates=True))
         model.learn(4)
     assert any("no discount head" in one for one in said)
+
+
+# -- rewards ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "then_fine_tunes", "warns"),
+    [
+        ({}, False, True),
+        ({"intrinsic_reward": "lbs"}, False, False),
+        ({"intrinsic_reward": "lbs"}, True, True),
+        ({"intrinsic_reward": "icm", "learn_task_reward": True}, False, True),
+    ],
+)
+def test_rewards_that_an_environment_hides_are_told_where_they_are_learnt(kwargs, then_fine_tunes, warns):
+    env = CounterEnv(3, observation_space=VECTOR, reward_free=True)
+    model = DreamerV2("MlpPolicy", env, preset="tiny", **SMALL, **kwargs)
+    with told_meanwhile() as said:
+        model.learn(8)
+        if then_fine_tunes:
+            model.fine_tune()
+            model.learn(8)
+    assert sum("reward_free=True" in one for one in said) == warns
+
+
+def test_a_task_without_rewards_says_so():
+    for free in (False, True):
+        env = gymnasium.make("urlb/walker-run-v0", observation="state", reward_free=free)
+        assert env.get_wrapper_attr("reward_free") is free

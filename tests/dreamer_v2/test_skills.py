@@ -128,6 +128,8 @@ def test_a_skill_by_number(skilled, method):
     assert model.policy.agent.skills.fixed.tolist() == [0, 0, 1, 0]
     with pytest.raises(ValueError, match=r"lie in \[0, 3\], got 4"):
         model.fix_skill(4)
+    with pytest.raises(ValueError, match="skill must be numbers, the number of a skill, or None, got True"):
+        model.fix_skill(True)
 
 
 def test_methods_without_skills_say_so(tiny_model):

@@ -24,6 +24,7 @@ OURS = {
     "domain": ["jaco", "x"],
     "max_episode_steps": [9],
     "never_terminates": [True, np.False_],
+    "reward_free": [True, np.False_],
     "task": ["run", "x"],
 }
 FOREIGN = st.one_of(
