@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -38,6 +39,26 @@ def put_around(env: VecEnv) -> list[Around]:
     :param env: vectorised; of what it holds, the spec tells
     """
     return [*_one_by_one(env_attribute(env, "spec", None)), *_vectorised(env)]
+
+
+def can_be_put_around(env: VecEnv) -> bool:
+    """Whether all of :func:`put_around` said what they were made with, and each is of one environment.
+
+    :param env: vectorised
+    """
+    return not _vectorised(env) and all(each.kwargs is not None for each in _one_by_one(env_attribute(env, "spec", None)))
+
+
+def with_the_wrappers_of(env: VecEnv, one: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """Put those of an environment around another one of its id.
+
+    :param env: vectorised, of which :func:`can_be_put_around` holds
+    :param one: of its id, as ``gymnasium.make`` gives it
+    """
+    for each in _one_by_one(env_attribute(env, "spec", None)):
+        module, _, name = each.kind.rpartition(".")
+        one = getattr(import_module(module), name)(one, **(each.kwargs or {}))
+    return one
 
 
 def _one_by_one(spec: EnvSpec | None) -> list[Around]:

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, 
 from sb3_dreamer_urlb.algorithm.environment_checks import given_env
 from sb3_dreamer_urlb.envs.facts import env_attribute
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
-from sb3_dreamer_urlb.envs.wrappers import put_around
+from sb3_dreamer_urlb.envs.wrappers import can_be_put_around, put_around, with_the_wrappers_of
 from sb3_dreamer_urlb.evaluation.open_loop import has_image, pictures_in
 from sb3_dreamer_urlb.spaces.comparing import check_same_spaces
 from sb3_dreamer_urlb.types import Observation
@@ -51,8 +51,8 @@ def env_to_play_in(model: AgentAlgorithm, env: GymEnv | str | None = None, argum
     """An environment as the model takes it: vectorised, normalised with the model's own statistics.
 
     :param model: that is to play
-    :param env: VecEnv of one environment, used as it is; an environment or its id; None makes another one of the same id
-        and arguments as the model's first
+    :param env: VecEnv of one environment, used as it is; an environment or its id; None makes another one of the same id,
+        arguments and, where all of them recorded their own, wrappers as the model's first
     :param argument: what the caller's user calls ``env``, for messages
     :raises ValueError: if it does not fit the model, or no environment can be made
     """
@@ -82,12 +82,14 @@ def _same_again(model: AgentAlgorithm, argument: str) -> gymnasium.Env[Any, Any]
     if train_env is None or spec is None:
         raise ValueError(f"Another environment like the model's cannot be made, as it has no registered id: give {argument}.")
     kwargs = {**spec.kwargs}
-    if around := put_around(train_env):
+    around = put_around(train_env)
+    if not can_be_put_around(train_env):
         names = ", ".join(each.kind.rpartition(".")[2] for each in around)
         warnings.warn(f"An environment like the model's is made to play in, without its wrappers ({names}): give {argument}.")
     if "rgb_array" in env_attribute(train_env, "metadata", {}).get("render_modes", ()):
         kwargs["render_mode"] = "rgb_array"
-    return gymnasium.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
+    one = gymnasium.make(spec.id, max_episode_steps=spec.max_episode_steps, **kwargs)
+    return with_the_wrappers_of(train_env, one) if can_be_put_around(train_env) else one
 
 
 def _normalized_alike(model: AgentAlgorithm, env: VecEnv) -> VecEnv:

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from tqdm import tqdm
 
 from sb3_dreamer_urlb.envs.facts import env_attribute
+from sb3_dreamer_urlb.envs.wrappers import can_be_put_around, put_around
 from sb3_dreamer_urlb.evaluation import recording
 from sb3_dreamer_urlb.hub import model_card as cards
 from sb3_dreamer_urlb.hub.algorithms import algorithm_of
@@ -192,8 +193,15 @@ def _check_given(
     :raises ValueError: naming everything that is missing
     """
     missing = []
-    if eval_env is None and (model.get_env() is None or _spec_of(model.get_env()) is None):
+    own = model.get_env()
+    if eval_env is None and (own is None or _spec_of(own) is None):
         missing.append("eval_env, an environment to evaluate in (the model has none that could be made again by its id)")
+    elif eval_env is None and own is not None and not can_be_put_around(own):
+        names = ", ".join(each.kind.rpartition(".")[2] for each in put_around(own))
+        missing.append(
+            f"eval_env, an environment to evaluate in (the model's has wrappers that are vectorised or did not record their "
+            f"arguments, {names}: the return without them would be another environment's)"
+        )
     if (
         env_id is None
         and not isinstance(eval_env, str)

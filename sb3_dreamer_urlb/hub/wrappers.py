@@ -27,5 +27,7 @@ def _as_call(wrapper: Around) -> str:
 
 
 def _shown(value: Any) -> str:
+    if isinstance(value, dict) and all(isinstance(one, str | int | float | None) for one in value.values()):
+        return repr(plain_for_everybody(value))
     plain = values.encode_or_describe(value)
     return repr(plain_for_everybody(plain)) if isinstance(plain, str | int | float | list | None) else "..."

@@ -30,7 +30,7 @@ def sample_dreamer_v2_params(
     trial.suggest_float("ent_coef", 1e-5, 1e-2, log=True)
     trial.suggest_float("free_nats", 0.1, 3.0, log=True)
     trial.suggest_float("kl_balance", 0.5, 0.95)
-    return {**convert_params(trial.params), "gradient_steps": n_envs}
+    return convert_params(_learning_as_often(trial, n_envs))
 
 
 def sample_drq_v2_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -47,7 +47,13 @@ def sample_drq_v2_params(trial: optuna.Trial, n_actions: int, n_envs: int, addit
     trial.suggest_categorical("n_steps", [1, 3, 5])
     trial.suggest_float("tau", 3e-3, 3e-2, log=True)
     trial.suggest_float("noise_std", 0.05, 0.5, log=True)
-    return {**convert_params(trial.params), "gradient_steps": n_envs}
+    return convert_params(_learning_as_often(trial, n_envs))
+
+
+def _learning_as_often(trial: optuna.Trial, n_envs: int) -> dict[str, Any]:
+    """A trial's numbers, that of the updates among them: whoever repeats it (``--trial-id``) has no others."""
+    trial.suggest_int("gradient_steps", n_envs, n_envs)
+    return trial.params
 
 
 def convert_params(params: dict[str, Any]) -> dict[str, Any]:

@@ -569,8 +569,10 @@ def test_the_card_names_wrappers(tiny_model, tmp_path):
     """Those that somebody put around; neither those of gymnasium.make and of the model, nor what is in the model's file."""
     plain = VecNormalize(make_vec_env(VECTORS, wrapper_class=Unrecorded, wrapper_kwargs={"depth": 3}), norm_reward=False)
     model = tiny_model(Passing(Passing(plain)), "MlpPolicy").learn(8)
-    with pytest.warns(UserWarning, match=r"without its wrappers \(Unrecorded, Passing, Passing\): give eval_env"):
+    with pytest.raises(ValueError, match=r"needs eval_env, .*record their arguments, Unrecorded, Passing, Passing:"):
         package_to_hub(model, tmp_path / "vectors", n_eval_episodes=1, video_length=0)
+    eval_env = VecNormalize(make_vec_env(VECTORS, wrapper_class=Unrecorded, wrapper_kwargs={"depth": 3}), norm_reward=False)
+    package_to_hub(model, tmp_path / "vectors", Passing(Passing(eval_env)), n_eval_episodes=1, video_length=0)
     found = json.loads((tmp_path / "vectors" / "config.json").read_text())["wrappers"]
     assert found == [f"{__name__}.Unrecorded(env, ...)", *[f"{__name__}.Passing(env, ...)"] * 2]
     watched = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make(VECTORS))
@@ -582,6 +584,27 @@ def test_the_card_names_wrappers(tiny_model, tmp_path):
     assert re.fullmatch(r"gymnasium\.wrappers\.[\w.]+\.TransformReward\(env, func=\.\.\.\)", second)
     text = card(tmp_path / "recorded").text
     assert f"| wrappers | `{first}`, `{second}` |" in text and f"# {first}\n# {second}\nmodel = " in text
+
+
+class Plus(gymnasium.RewardWrapper, gymnasium.utils.RecordConstructorArgs):
+    """Says what it was made with."""
+
+    def __init__(self, env, by):
+        gymnasium.utils.RecordConstructorArgs.__init__(self, by=by)
+        gymnasium.RewardWrapper.__init__(self, env)
+        self.by = by
+
+    def reward(self, reward):
+        return reward + self.by["reward"]
+
+
+def test_the_return_on_a_card_is_that_of_the_wrapped_environment(tiny_model, tmp_path):
+    env = Plus(gymnasium.make(ID, length=5), by={"reward": 100.0})
+    model = tiny_model(env).learn(8)
+    package_to_hub(model, tmp_path, n_eval_episodes=1, video_length=0)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["mean_reward"] > 400
+    assert json.loads((tmp_path / "config.json").read_text())["wrappers"] == [f"{__name__}.Plus(env, by={{'reward': 100.0}})"]
 
 
 def test_a_usual_environment_needs_no_arguments(model, tmp_path):

@@ -562,13 +562,15 @@ def test_plot_says_when_episodes_are_too_few(zoo, capsys, monkeypatch):
     plt.close("all")
 
 
-def test_optimize(zoo, monkeypatch):
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_optimize(zoo, monkeypatch, n_envs):
     seen = []
     learn = DreamerV2.learn
     monkeypatch.setattr(DreamerV2, "learn", lambda model, *args, **kwargs: (seen.append(model), learn(model, *args, **kwargs)))
     search = ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
     study = ["--study-name", "walker", "--storage", "study.log"]
-    train(zoo, STAND, 30, "lbs", *search, *study, params=TINY)
+    params = [*TINY, f"n_envs:{n_envs}"]
+    train(zoo, STAND, 30, "lbs", *search, *study, params=params)
     [report] = Path("logs/dreamerv2").glob("report_*.csv")
     header, *trials = report.read_text().splitlines()
     assert len(trials) == 2 and all("COMPLETE" in trial for trial in trials)
@@ -577,8 +579,10 @@ def test_optimize(zoo, monkeypatch):
     assert len(seen) == 2 and not list(Path().rglob("snapshot_*"))
     assert len({model.learning_rate for model in seen}) == 2
     last = seen[1]
-    model = model_in(train(zoo, STAND, 8, "lbs", *study, "--trial-id", "1", params=TINY))
-    assert (model.actor_learning_rate, model.batch_length) == (last.actor_learning_rate, last.batch_length)
+    model = model_in(train(zoo, STAND, 8, "lbs", *study, "--trial-id", "1", params=params))
+    for name in ("actor_learning_rate", "batch_length", "gradient_steps"):
+        assert getattr(model, name) == getattr(last, name)
+    assert model.gradient_steps == n_envs
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
