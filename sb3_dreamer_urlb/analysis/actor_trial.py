@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dreamer_urlb.analysis.trajectories import check_has_model
 from sb3_dreamer_urlb.evaluation.episodes import run_evaluation
@@ -43,13 +43,13 @@ class ActorTrial:
         return float(np.mean(self.pretrained)) > float(np.mean(self.fresh))
 
 
-def try_actor(model: DreamerV2, env: VecEnv, episodes: int = EPISODES, seed: int = SEED) -> ActorTrial:
+def try_actor(model: DreamerV2, env: GymEnv | str, episodes: int = EPISODES, seed: int = SEED) -> ActorTrial:
     """Play the task with the pre-trained actor and with a fresh one, both exploring as fine-tuning would.
 
     ``model.fine_tune(env, keep_actor=try_actor(model, env).keep)``. The model stays as it is.
 
     :param model: pre-trained
-    :param env: of the task
+    :param env: of the task, vectorised or not, or its id
     :param episodes: with each actor; the same ones
     :param seed: of the first
     :raises ValueError: for a model that is not pre-training, or whose actor has never learnt

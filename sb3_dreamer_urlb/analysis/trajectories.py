@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_dreamer_urlb.envs.info_keys import TERMINAL
+from sb3_dreamer_urlb.evaluation.episodes import as_played
 from sb3_dreamer_urlb.evaluation.protocol import stacked
 from sb3_dreamer_urlb.folders import made_folder
 from sb3_dreamer_urlb.number_checks import check_integer
@@ -51,18 +53,18 @@ class Trajectory:
         return len(self.actions)
 
 
-def play_trajectories(model: DreamerV2, env: VecEnv, count: int = TRAJECTORIES, seed: int = SEED) -> list[Trajectory]:
+def play_trajectories(model: DreamerV2, env: GymEnv | str, count: int = TRAJECTORIES, seed: int = SEED) -> list[Trajectory]:
     """Let an oracle play, deterministically, as it has learnt to act.
 
     :param model: the oracle
-    :param env: of the task
+    :param env: of the task, vectorised or not, or its id
     :param count: episodes
     :param seed: of the first; episode ``i`` begins with the seed ``seed + i``
     :raises ValueError: for a number that is not positive, or a wrapper around VecNormalize that changes observations further:
         what the environment gave is then lost
     """
     check_integer("trajectories", count, 1)
-    env, normalizer = _before_normalization(env)
+    env, normalizer = _before_normalization(as_played(model, env))
     played: list[Trajectory] = []
     with th.random.fork_rng([model.device] if model.device.type == "cuda" else []):
         th.manual_seed(seed)

@@ -200,7 +200,13 @@ def make_rwrl_env(
             f"perturbations={options['perturbations']!r}: the Real-World RL suite's {domain}-{task} is perturbed already, "
             f"by its level {level}; perturb urlb/{domain}-{task}-v0 instead"
         )
+    if options.get("domain_rewards"):
+        raise ValueError(
+            f"domain_rewards={options['domain_rewards']!r}: ids of the Real-World RL suite do not tell them; "
+            f"urlb/{domain}-{task}-v0 does, with perturbations={level!r} or others"
+        )
     options.pop("perturbations", None)
+    options.pop("domain_rewards", None)
     known = {field.name for field in dataclasses.fields(PixelOptions)}
     refuse_unknown(
         {name: value for name, value in options.items() if name not in known},

@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv, PolicyPredictor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
-from sb3_dreamer_urlb.evaluation.recording import copy_statistics
+from sb3_dreamer_urlb.evaluation.recording import copy_statistics, env_to_play_in
 from sb3_dreamer_urlb.number_checks import check_integer
 from sb3_dreamer_urlb.planning import planner_name
 
@@ -62,7 +65,7 @@ class Evaluation:
 
 def run_evaluation(
     model: PolicyPredictor,
-    env: VecEnv,
+    env: GymEnv | str,
     episodes: int = EPISODES,
     seed: int = SEED,
     planner: str = AUTO,
@@ -76,7 +79,7 @@ def run_evaluation(
     and do not move; returns are the task's own.
 
     :param model: anything with SB3's ``predict``
-    :param env: to play in, not the one that the model trains in
+    :param env: to play in, not the one that the model trains in; of one that is not vectorised, or an id, a VecEnv is made
     :param episodes: how many
     :param seed: of the first
     :param planner: ``"auto"`` as the model would act now, ``"on"``, ``"off"`` for the actor alone
@@ -85,6 +88,7 @@ def run_evaluation(
     """
     check_integer("episodes", episodes, 1)
     check_integer("seed", seed, 0)
+    env = as_played(model, env)
     actor, name = _acting(model, planner)
     device = getattr(model, "device", th.device("cpu"))
     began = time.perf_counter()
@@ -96,6 +100,21 @@ def run_evaluation(
             played += _first_episodes(actor, env, count, seed + len(played), deterministic)
     returns, lengths = ([episode[part] for episode in played] for part in (0, 1))
     return Evaluation(returns, [int(length) for length in lengths], name, time.perf_counter() - began, seed, deterministic)
+
+
+def as_played(model: Any, env: GymEnv | str) -> VecEnv:
+    """An environment as a model is evaluated in it: a VecEnv as it is, another one vectorised, and normalised as the model's.
+
+    :param model: that is to play
+    :param env: vectorised or not, or its id
+    :raises ValueError: for what does not fit the model
+    """
+    if isinstance(env, VecEnv):
+        return env
+    if hasattr(model, "loaded_statistics"):
+        return env_to_play_in(model, env)
+    one: Any = maybe_make_env(env, 0)
+    return DummyVecEnv([lambda: one if is_wrapped(one, Monitor) else Monitor(one)])
 
 
 def expected(

@@ -271,6 +271,16 @@ def written_at(folder: str | os.PathLike[str]) -> float:
     return path.stat().st_mtime
 
 
+def _seed_from(seed: int, steps: int) -> int:
+    """What an environment is seeded with where a run goes on: the run's own seed would bring the first episodes back, which
+    is right only before any step was made.
+
+    :param seed: of the run
+    :param steps: agent steps so far
+    """
+    return seed if steps == 0 else int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) >> 1
+
+
 def steps_done(folder: str | os.PathLike[str]) -> int:
     """Agent steps (``num_timesteps``) at the last checkpoint.
 
@@ -302,7 +312,5 @@ def resume(algorithm: type[Model], folder: str | os.PathLike[str], env: Any, **k
         model, run, statistics = model_snapshot.load(algorithm, run_folder.snapshot, env, resume=True, **kwargs)
         run_folder.restore(model, run, statistics)
     if model.env is not None and model.seed is not None:
-        # The run's own seed would bring the first episodes' resets back.
-        sequence = np.random.SeedSequence([model.seed, model.num_timesteps])
-        model.env.seed(int(sequence.generate_state(1)[0]) >> 1)
+        model.env.seed(_seed_from(model.seed, model.num_timesteps))
     return model, run_folder

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_dreamer_urlb import DreamerV2
 from sb3_dreamer_urlb.__main__ import main
 from sb3_dreamer_urlb.analysis.actor_trial import ActorTrial, try_actor
+from sb3_dreamer_urlb.analysis.trajectories import play_trajectories
 
 
 class PaysForTheFirstNumber(gymnasium.Wrapper):
@@ -41,6 +42,16 @@ def test_who_finds_more_is_kept(snapshots, weights, sign, keep):
     assert trial.keep is keep and len(trial.pretrained) == len(trial.fresh) == 2
     assert trial.frames == 4 * STEPS * model.action_repeat
     assert weights(model.policy) == before and th.equal(state, th.get_rng_state())
+
+
+def test_an_environment_need_not_be_vectorised(snapshots):
+    model = DreamerV2.load(snapshots(), env=gymnasium.make(ENV), device="cpu")
+    expected = try_actor(model, make_vec_env(ENV, 1), 2)
+    for env in (gymnasium.make(ENV), ENV):
+        assert try_actor(model, env, 2) == expected
+        assert len(play_trajectories(model, env, 1)) == 1
+    with pytest.raises(ValueError, match="does not fit the model"):
+        try_actor(model, gymnasium.make("CartPole-v1"), 1)
 
 
 def test_where_neither_finds_anything_the_actor_goes():

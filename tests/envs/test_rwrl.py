@@ -46,6 +46,14 @@ def test_facts_of_the_ids(domain, level):
     assert env.get_wrapper_attr("max_episode_steps") == 500
 
 
+def test_what_other_ids_tell_is_named():
+    with pytest.raises(
+        ValueError, match="domain_rewards=True: ids of the Real-World RL suite do not tell them; urlb/walker-walk"
+    ):
+        make_rwrl_env("walker", "walk", "hard", domain_rewards=True, observation="state")
+    make_rwrl_env("walker", "walk", "hard", domain_rewards=False, observation="state").close()
+
+
 def test_pictures_of_a_body_that_changes():
     env = make_rwrl_env("walker", "walk", "hard", fast_render=True)
     frames = [env.reset(seed=0)[0], env.reset()[0]]

@@ -18,7 +18,9 @@ import torch as th
 from fake_envs import CounterEnv
 from places import PYTHONPATH
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
-from whole_runs import LENGTH, SmallDisk, everything, scramble, vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+from whole_runs import LENGTH, RepeatingEnv, SmallDisk, crash, everything, scramble, vec_env
 
 from sb3_dreamer_urlb import DreamerV2, PhaseSwitchCallback, RunCheckpointCallback, SnapshotError
 from sb3_dreamer_urlb.runs.run_folder import RunFolder
@@ -109,6 +111,29 @@ def test_a_resumed_environment_does_not_replay_the_first_resets(tiny_model, tmp_
 
 
 # -- the folder ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_killed_at_its_very_beginning_is_the_run_itself(tiny_model, tmp_path):
+    """Its first episodes, too, are those that its seed begins."""
+
+    class Seeded(RepeatingEnv):
+        """Its rewards are its seed's."""
+
+        def step(self, action):
+            seen, _, *ends = super().step(action)
+            return seen, float(self.np_random.random()), *ends
+
+    def run(folder, steps, until=None):
+        scramble()
+        model = tiny_model(DummyVecEnv([lambda: Monitor(Seeded(20))]), seed=5)
+        callbacks = [RunCheckpointCallback(tmp_path / folder, 10**6, resume="auto")]
+        if until is not None:
+            crash(model, until, steps, callbacks)
+        return model if until is not None else model.learn(steps, callback=callbacks)
+
+    expected = everything(run("whole", 60))
+    run("cut", 60, until=30)
+    assert everything(run("cut", 60)) == expected
 
 
 def test_nothing_to_resume(tmp_path):
